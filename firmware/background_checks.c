@@ -91,8 +91,7 @@ COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *i
 }
 
 /* Of the same sample: phases that conduct above the currents whose errors are those of the converter, for so short a
- * time that a warm winding and the error of the voltage are less than half of the flux linkage. That of the voltage
- * is that of a cold winding. */
+ * time that a warm winding and the error of the voltage are less than half of the flux linkage. */
 static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_monitor_input_t *input,
                                              const encoder_monitor_input_t *encoder, uint32_t elapsed, uint32_t step) {
     const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
@@ -115,7 +114,8 @@ static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_m
         const int32_t drop_q29 = encoder->drop_q29[phase];
         const int64_t error_q29 = applied_flux_warm_q29(&machine_tables, drop_q29) + fixed_product(voltage_q29, age);
         const int32_t table_q29 = drive->phases.phase[phase].table_q29;
-        sample.flux_q29[phase] = fixed_add(encoder->flux_q29[phase], applied_flux_cold_q29(drop_q29));
+        sample.flux_q29[phase] = encoder->flux_q29[phase];
+        sample.cold_q29[phase] = applied_flux_cold_q29(drop_q29);
         sample.table_q29[phase] = table_q29;
         sample.known[phase] = encoder->known[phase] && since_zero < recent && error_q29 < table_q29 / 2 &&
                               current_q9 > machine_tables.current_range_q9 / 32;

@@ -22,6 +22,7 @@ static void add(phase_balance_t *balance, const phase_balance_sample_t *sample) 
         if (sample->known[index]) {
             const int32_t flux_q29 = sample->flux_q29[index];
             phase->flux_sum_q21 += (uint64_t)((flux_q29 > 0 ? flux_q29 : 0) >> 8) * sample->elapsed;
+            phase->cold_sum_q21 += (uint64_t)(sample->cold_q29[index] >> 8) * sample->elapsed;
             phase->table_sum_q21 += (uint64_t)(sample->table_q29[index] >> 8) * sample->elapsed;
             phase->conducting += sample->elapsed;
         }
@@ -33,18 +34,19 @@ static void begin(phase_balance_t *balance) {
     balance->periods = 0;
     for (unsigned index = 0; index < HAL_PHASES_MAX; index++) {
         phase_balance_phase_t *phase = &balance->phase[index];
-        phase->flux_sum_q21 = phase->table_sum_q21 = 0;
+        phase->flux_sum_q21 = phase->cold_sum_q21 = phase->table_sum_q21 = 0;
         phase->conducting = 0;
     }
 }
 
-/* Ratio of a phase, Q8, 0..65535; 0 when it has hardly conducted. */
-static uint32_t ratio_q8(const phase_balance_t *balance, unsigned index) {
+/* Ratio of a phase, of a cold winding or of one as its parameter says, Q8, 0..65535; 0 when it has hardly conducted. */
+static uint32_t ratio_q8(const phase_balance_t *balance, unsigned index, bool cold) {
     const phase_balance_phase_t *phase = &balance->phase[index];
     if (phase->conducting < balance->periods / CONDUCTING_PART || phase->table_sum_q21 == 0) {
         return 0;
     }
-    const int64_t ratio = fixed_divide((int64_t)phase->flux_sum_q21 << 8, (int64_t)phase->table_sum_q21);
+    const uint64_t sum_q21 = phase->flux_sum_q21 + (cold ? phase->cold_sum_q21 : 0);
+    const int64_t ratio = fixed_divide((int64_t)sum_q21 << 8, (int64_t)phase->table_sum_q21);
     return ratio < UINT16_MAX ? (uint32_t)ratio : UINT16_MAX;
 }
 
@@ -67,9 +69,9 @@ static void judge(phase_balance_t *balance, const phase_balance_sample_t *sample
     uint32_t judged = sample->lost;
     bool ahead = true;
     for (unsigned index = 0; index < phases; index++) {
-        ratios_q8[index] = ratio_q8(balance, index);
+        ratios_q8[index] = ratio_q8(balance, index, false);
         judged |= (uint32_t)(ratios_q8[index] > 0) << index;
-        ahead &= ratios_q8[index] < sample->least_q8;
+        ahead &= ratio_q8(balance, index, true) < sample->least_q8;
     }
     const bool all = judged == (1u << phases) - 1u;
     const bool comparable = all && phases - (sample->lost != 0) >= COMPARED_MIN;

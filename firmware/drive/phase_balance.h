@@ -5,8 +5,8 @@
  * What the machine, the DC link and all sensors have in common changes this ratio in all phases alike. So the ratio of
  * one phase to that of the others shows an error of its current sensor which is within the tolerances of a single
  * sample (drive/phase_monitor.h), and a ratio that is small in all of them an encoder that is ahead of the rotor: drops
- * of the devices and a warm winding make it larger only, and for a cold one the integral has four fifths of the
- * resistance. Where drift may be most of the integral the ratio shows nothing: such samples do not count.
+ * of the devices and a warm winding make it larger only, and what a cold one makes it smaller is added. Where drift may
+ * be most of the integral the ratio shows nothing: such samples do not count.
  *
  *   current_sensor  the ratio of a phase is more than 4/3 of those of all others, or less than 3/4
  *   encoder_angle   the ratio of every phase is below a limit, twice in succession
@@ -37,13 +37,14 @@ typedef struct {
     uint32_t periods_per_ms;           /* from 20 */
     uint32_t step;                     /* rotation since then, 2^-32 electrical rev */
     int32_t flux_q29[HAL_PHASES_MAX];  /* by the voltage since the phase was without current, Wb, Q2.29 */
+    int32_t cold_q29[HAL_PHASES_MAX];  /* of a cold winding more, Wb, Q2.29, >= 0 */
     int32_t table_q29[HAL_PHASES_MAX]; /* by the tables, Wb, Q2.29 */
     bool known[HAL_PHASES_MAX];        /* conducts, and drift is the smaller part of the integral */
 } phase_balance_sample_t;
 
 typedef struct {
-    uint64_t flux_sum_q21, table_sum_q21; /* over the periods of a window, Wb, Q21 */
-    uint32_t conducting;                  /* these periods */
+    uint64_t flux_sum_q21, cold_sum_q21, table_sum_q21; /* over the periods of a window, Wb, Q21 */
+    uint32_t conducting;                                /* these periods */
 } phase_balance_phase_t;
 
 typedef struct {

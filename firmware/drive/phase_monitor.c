@@ -45,7 +45,10 @@ typedef struct {
     int32_t step;      /* rotation since then, 2^-32 electrical rev */
     int32_t offset_q9; /* tolerance of a current, A, Q7.9 */
     int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
-    int32_t error_q29; /* of a period's voltage, Wb, Q2.29 */
+    /* Of a period, Wb, Q2.29: */
+    int32_t voltage_q29; /* error of the voltage, by its sensor or by pulses that do not act */
+    int32_t device_q29;  /* threshold of the devices */
+    int32_t error_q29;   /* the larger one */
 } common_t;
 
 /* Largest and smallest flux linkage at a measured current, at a distance. */
@@ -63,23 +66,31 @@ NOINLINE static uint32_t distance_of(const phase_monitor_input_t *input, unsigne
     return phase_map_distance(input->electrical - phase * input->stroke - (uint32_t)input->misalignment[phase]);
 }
 
-/* Tolerance of the integral but for the resistance, Wb, Q2.29: what has accumulated since the phase was at rest, or in
- * FOLLOW_MS. */
-static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+/* Sum of two independent errors, about the root of the sum of their squares. */
+static int64_t independent(int64_t a, int64_t b) {
+    return a > b ? a + b / 4 : b + a / 4;
+}
+
+/* Tolerance of the integral, Wb, Q2.29: what has accumulated since the phase was at rest, or in FOLLOW_MS, of the error
+ * of the voltage and of what winding and devices take more or less, which are independent; and delays. */
+static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase,
+                         int64_t resistive_q29) {
+    const int64_t voltage_q29 = (int64_t)common->voltage_q29 * (int32_t)state->conducting;
     /* An error at the largest flux linkage remains while it falls. */
     const int32_t fallen_q29 = state->peak_q29 - common->input->flux_q29[phase];
-    return fixed_saturate((int64_t)common->error_q29 * (int32_t)state->conducting + common->delay_q29 + fallen_q29 / 4);
+    return fixed_saturate(independent(voltage_q29, resistive_q29) + common->delay_q29 + fallen_q29 / 4);
 }
 
 /* Least and largest flux linkage that the voltage may have built up, Wb, Q2.29. */
 static int32_t least_applied_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
+    const int64_t devices_q29 = (int64_t)common->device_q29 * (int32_t)state->conducting;
     const int32_t warm_q29 = applied_flux_warm_q29(common->tables, state->followed_drop_q29);
-    return fixed_subtract(common->input->flux_q29[phase], fixed_add(slack_q29(common, state, phase), warm_q29));
+    return fixed_subtract(common->input->flux_q29[phase], slack_q29(common, state, phase, warm_q29 + devices_q29));
 }
 
 static int32_t most_applied_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase) {
     const int32_t cold_q29 = applied_flux_cold_q29(state->followed_drop_q29);
-    return fixed_add(common->input->flux_q29[phase], fixed_add(slack_q29(common, state, phase), cold_q29));
+    return fixed_add(common->input->flux_q29[phase], slack_q29(common, state, phase, cold_q29));
 }
 
 /* R i over the periods between two inputs, Wb, Q2.29. */
@@ -379,7 +390,8 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
     const uint32_t elapsed = input->periods - monitor->periods;
     const int32_t shortest_q29 =
         applied_flux_shortest_pulse_q29(period_q29, tables->minimum_pulse_ns, input->periods_per_ms);
-    const int32_t voltage_q29 = applied_flux_voltage_error_q29(tables, period_q29, input->period_q40);
+    const int32_t voltage_q29 = shortest_q29 > period_q29 / 64 ? shortest_q29 : period_q29 / 64;
+    const int32_t device_q29 = applied_flux_device_q29(tables, input->period_q40);
     return (common_t){
         .tables = tables,
         .input = input,
@@ -388,7 +400,9 @@ static common_t common_of(const phase_monitor_t *monitor, const machine_tables_t
         .step = (int32_t)(input->electrical - monitor->electrical),
         .offset_q9 = tables->current_range_q9 / 128,
         .delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)input->periods_per_ms),
-        .error_q29 = shortest_q29 > voltage_q29 ? shortest_q29 : voltage_q29,
+        .voltage_q29 = voltage_q29,
+        .device_q29 = device_q29,
+        .error_q29 = voltage_q29 > device_q29 ? voltage_q29 : device_q29,
     };
 }
 
