@@ -59,6 +59,12 @@ static inline int32_t applied_flux_voltage_error_q29(const machine_tables_t *tab
     return device_q29 > period_flux_q29 / 64 ? device_q29 : period_flux_q29 / 64;
 }
 
+/* Two independent errors together, >= 0: the larger one and a quarter of the other, within 12 % of the root of the sum
+ * of their squares. */
+static inline int64_t applied_flux_independent(int64_t a, int64_t b) {
+    return a > b ? a + b / 4 : b + a / 4;
+}
+
 /* Constants of a period for all phases. */
 typedef struct {
     int32_t full_q32;    /* Vdc Ts, Wb */

@@ -135,8 +135,8 @@ static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *paramete
     const int32_t drop_q29 = input->drop_q29[index];
     const int32_t resistive_q29 =
         small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(&machine_tables, drop_q29);
-    return fixed_saturate(input->flux_step_max_q29 / 4 + drift_of(parameters, input, true) * (int32_t)age +
-                          resistive_q29);
+    const int64_t drift_q29 = drift_of(parameters, input, true) * (int32_t)age;
+    return fixed_saturate(input->flux_step_max_q29 / 4 + applied_flux_independent(drift_q29, resistive_q29));
 }
 
 /* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
@@ -202,9 +202,10 @@ static bool has_moved(const encoder_monitor_parameters_t *parameters, encoder_mo
     const int32_t drop_q29 = fixed_multiply_high(current_q9 << 12, parameters->resistance_period_q40);
     phase->drop_q29 = fixed_saturate(phase->drop_q29 + (int64_t)drop_q29 * (int32_t)(periods & 0xffffu));
     const bool falls = excess_q29 < phase->excess_q29;
-    const int32_t drift_q29 = fixed_saturate(
-        drift_of(parameters, input, moves) * (int32_t)summed +
-        (falls ? applied_flux_cold_q29(phase->drop_q29) : applied_flux_warm_q29(&machine_tables, phase->drop_q29)));
+    const int32_t resistive_q29 =
+        falls ? applied_flux_cold_q29(phase->drop_q29) : applied_flux_warm_q29(&machine_tables, phase->drop_q29);
+    const int32_t drift_q29 =
+        fixed_saturate(applied_flux_independent(drift_of(parameters, input, moves) * (int32_t)summed, resistive_q29));
     const int32_t change_q29 = fixed_abs(fixed_subtract(excess_q29, phase->excess_q29));
     const int32_t tolerance_q29 = drift_q29 + (range.most_q29 - range.least_q29) + (table_q29 >> SHAPE_SHIFT) +
                                   (fixed_abs(table_q29 - phase->table_q29) >> GAIN_SHIFT);

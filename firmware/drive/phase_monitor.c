@@ -66,11 +66,6 @@ NOINLINE static uint32_t distance_of(const phase_monitor_input_t *input, unsigne
     return phase_map_distance(input->electrical - phase * input->stroke - (uint32_t)input->misalignment[phase]);
 }
 
-/* Sum of two independent errors, about the root of the sum of their squares. */
-static int64_t independent(int64_t a, int64_t b) {
-    return a > b ? a + b / 4 : b + a / 4;
-}
-
 /* Tolerance of the integral, Wb, Q2.29: what has accumulated since the phase was at rest, or in FOLLOW_MS, of the error
  * of the voltage and of what winding and devices take more or less, which are independent; and delays. */
 static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *state, unsigned phase,
@@ -78,7 +73,7 @@ static int32_t slack_q29(const common_t *common, const phase_monitor_phase_t *st
     const int64_t voltage_q29 = (int64_t)common->voltage_q29 * (int32_t)state->conducting;
     /* An error at the largest flux linkage remains while it falls. */
     const int32_t fallen_q29 = state->peak_q29 - common->input->flux_q29[phase];
-    return fixed_saturate(independent(voltage_q29, resistive_q29) + common->delay_q29 + fallen_q29 / 4);
+    return fixed_saturate(applied_flux_independent(voltage_q29, resistive_q29) + common->delay_q29 + fallen_q29 / 4);
 }
 
 /* Least and largest flux linkage that the voltage may have built up, Wb, Q2.29. */
