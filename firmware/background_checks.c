@@ -156,6 +156,36 @@ static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *inp
     }
 }
 
+/* Scale of the tables, by the state of the phases after their check. An integral that is 0 with a current has been
+ * limited there. */
+static void follow_table_scale(drive_t *drive, const phase_monitor_input_t *input,
+                               const encoder_monitor_input_t *encoder, uint32_t elapsed) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const int32_t period_q40 = parameters->predictive.period_q40;
+    const int32_t periods = (int32_t)(elapsed & 0xffu);
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        const phase_monitor_phase_t *state = &drive->phases.phase[phase];
+        const table_scale_sample_t sample = {
+            .current_q9 = input->current_q9[phase],
+            .flux_q29 = encoder->flux_q29[phase],
+            .table_q29 = state->table_q29,
+            .periods = (uint32_t)periods,
+            .drop_q29 = applied_flux_period_q29(machine_tables.device_drop_q6, period_q40) * periods,
+            .zero = state->zero_at == input->periods,
+            .known = encoder->known[phase],
+            .emptied = input->flux_q29[phase] == 0,
+        };
+        table_scale_add(&drive->table_scale, phase, &sample, machine_tables.current_range_q9 / 32);
+    }
+    table_scale_follow(&drive->table_scale, parameters->table_scale_part_q31 * periods);
+    const bool follows = parameters->table_scale_part_q31 != 0;
+    const table_scale_factors_t factors =
+        table_scale_factors(follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &parameters->predictive.flux);
+    hal_critical_enter(drive->hal);
+    drive->control.table_scale = factors;
+    hal_critical_leave(drive->hal);
+}
+
 /* Checks phases and encoder, and corrects the integrals. */
 COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
     const phase_monitor_input_t *input = &sample->phases;
@@ -170,6 +200,9 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     drive->phases.phases |= drive->balance.phases;
     if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
         follow_misalignment(drive, input, &encoder, elapsed);
+    }
+    if (input->run) {
+        follow_table_scale(drive, input, &encoder, elapsed);
     }
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));

@@ -74,6 +74,7 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     drive->comms.trace = &drive->trace;
     drive->comms.self_test = &drive->self_test;
     drive->comms.control_parameters = &drive->control_parameters;
+    table_scale_reset(&drive->table_scale);
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
     drive->control.reported_fault_mask = self_test_faults(&drive->self_test);

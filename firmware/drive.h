@@ -7,6 +7,7 @@
 
 #include "comms/comms.h"
 #include "control/flux_angle.h"
+#include "control/table_scale.h"
 #include "drive/configure.h"
 #include "drive/control.h"
 #include "drive/encoder_monitor.h"
@@ -59,6 +60,7 @@ typedef struct {
     phase_monitor_t phases;
     phase_balance_t balance;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
+    table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
     encoder_monitor_t encoder;
     thermal_t thermal;

@@ -61,6 +61,15 @@ static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry)
         lost ? degraded_torque_q24(&drive->control_parameters.degraded, state, &machine_tables, electrical) : 0);
 }
 
+/* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
+static void collect_estimates(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const int64_t error_q40 = (int64_t)drive->table_scale.resistance_q40 * drive->control_rate_hz;
+    const int32_t resistance_q24 =
+        fixed_saturate(drive->parameters.values[PARAMETER_RESISTANCE_OHM] + fixed_shift(error_q40, 16));
+    telemetry->estimates.table_scale = (uint32_t)fixed_shift(drive->control.table_scale.scale_q30, 15);
+    telemetry->estimates.resistance_ohm = (uint32_t)fixed_non_negative(resistance_q24);
+}
+
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -163,6 +172,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->self_test = telemetry_self_test(drive);
 
     collect_degraded(drive, telemetry);
+
+    collect_estimates(drive, telemetry);
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;

@@ -94,6 +94,7 @@ typedef struct {
     uint16_t device_drop_most_q6;  /* threshold, V, Q10.6 */
     uint16_t device_resistance_q8; /* slope, parts of the resistance of the winding, Q8.8, up to 64 */
     uint16_t minimum_pulse_ns;     /* of the converter; shorter pulses and gaps of a switch do not act, 0..2000 */
+    uint16_t device_drop_q6;       /* of a switch and a diode, through which a phase's current flows, V, Q10.6 */
     int32_t current_slew_rate_A_s; /* di/dt at the unaligned position: supply voltage / inductance */
     /* Below the over-voltage threshold, in which braking torque decreases so that the DC link has room for the fields
      * of the phases: by the voltage of each period, and by its mean. V, Q10.6; 0 for an ideal link. */

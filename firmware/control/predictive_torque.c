@@ -194,14 +194,14 @@ static inline int32_t removable_flux(const period_t *period, uint32_t travel) {
 }
 
 /* Predicts the flux linkage of a phase and which flux linkages the coming period can reach from there. */
-static inline void predict_flux(const predictive_torque_parameters_t *parameters, predictive_torque_t *control,
+static inline void predict_flux(predictive_torque_t *control,
                                 const predictive_torque_sample_t *sample, unsigned phase, int32_t flux_step_max_q29,
                                 unsigned flux_shift, plan_t *p) {
     int32_t *flux_q29 = &control->flux_q29[phase];
     /* Q15 * Q29 to Q29. */
     const int32_t applied_q29 = fixed_multiply_high(control->duty_q15[phase] * (1 << 14), flux_step_max_q29 << 3);
     const int32_t resistive_drop_q29 =
-        flux_observer_step(&parameters->flux, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift),
+        flux_observer_step(sample->flux_observer, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift),
                            applied_q29, sample->current_q9[phase]);
     p->freewheeling_q29 = fixed_subtract(*flux_q29, resistive_drop_q29);
     p->flux_min = non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
@@ -292,7 +292,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const unsigned phases = tables->phases < HAL_PHASES_MAX ? tables->phases : HAL_PHASES_MAX;
     /* Vdc Ts: Q6 * Q40 to Q29. */
     const int32_t flux_step_max_q29 =
-        fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, parameters->period_q40), FLUX_STEP_MIN_Q29,
+        fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, sample->period_q40), FLUX_STEP_MIN_Q29,
                     FLUX_STEP_LIMIT_Q29);
 
     const unsigned torque_shift = tables->torque_format.result_shift;
@@ -313,7 +313,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
         plan_t *p = &plan[phase];
-        predict_flux(parameters, control, sample, phase, flux_step_max_q29, flux_shift, p);
+        predict_flux(control, sample, phase, flux_step_max_q29, flux_shift, p);
         const uint32_t angle = sample->angle - phase * parameters->stroke - (uint32_t)sample->misalignment[phase];
         const bool positive = angle >= HALF_REV;
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */

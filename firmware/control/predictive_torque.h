@@ -80,6 +80,9 @@ typedef struct {
     bool reverse;                   /* negative direction of rotation */
     uint32_t lost_phase;            /* number from 1 on of a phase without voltage, which the others replace; 0: none */
     uint32_t angle_step;            /* magnitude of the rotation per period, 2^-32 electrical rev */
+    const flux_observer_parameters_t *flux_observer; /* with the resistance, and the period, over the scale of the
+                                                      * tables, table_scale.h */
+    int32_t period_q40;             /* s, Q-9.40 */
 } predictive_torque_sample_t;
 
 /* Flux linkages and duties 0. */

@@ -14,6 +14,8 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
     state_machine_reset(&state->state_machine);
     control_prepare(parameters, state);
     state->deferred_request.initial.observer = load_observer_inertia(&parameters->observer, 0);
+    state->table_scale = table_scale_factors(TABLE_SCALE_ONE_Q30, parameters->predictive.period_q40,
+                                             &parameters->predictive.flux);
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
@@ -51,7 +53,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
         start(state, measured);
     }
     const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
-    measure_torque(parameters, &state->predictive, deferred->predictive.misalignment, fault_mask != 0, measured);
+    measure_torque(parameters, state, deferred->predictive.misalignment, fault_mask != 0);
     observe(parameters, state, deferred, measured);
     const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
     if (run) {

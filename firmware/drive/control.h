@@ -33,6 +33,7 @@
 #include "control/speed_pi.h"
 #include "control/speed_smc.h"
 #include "control/stroke_mean.h"
+#include "control/table_scale.h"
 #include "control/torque_mode.h"
 #include "control/torque_offset.h"
 #include "control/torque_trim.h"
@@ -99,7 +100,8 @@ typedef struct {
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
     slow_counts_parameters_t slow_counts;
-    encoder_monitor_parameters_t encoder_monitor; /* this and the next three: background */
+    encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
+    int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
     degraded_parameters_t degraded;
     thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
     temperature_parameters_t temperature;
@@ -191,6 +193,7 @@ typedef struct {
     int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:
                                                   unknown */
     int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
+    table_scale_factors_t table_scale; /* written by the background with the interrupts masked */
 } control_state_t;
 
 /* State INITIALISE, rotor at standstill, controllers reset. */

@@ -112,14 +112,16 @@ static int32_t torque_by_plan(const predictive_torque_t *predictive, control_mea
     return sum;
 }
 
-void measure_torque(const control_parameters_t *parameters, const predictive_torque_t *predictive,
-                    const int32_t misalignment[HAL_PHASES_MAX], bool failed, control_measurement_t *measured) {
+void measure_torque(const control_parameters_t *parameters, control_state_t *state,
+                    const int32_t misalignment[HAL_PHASES_MAX], bool failed) {
+    control_measurement_t *measured = &state->measurement;
     int32_t sum = 0;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        sum = torque_by_plan(predictive, measured);
+        sum = torque_by_plan(&state->predictive, measured);
     } else if (!failed) {
         commutation_find(&parameters->commutation, &measured->commutation);
         sum = torque_by_map(parameters, misalignment, measured);
     }
-    measured->torque_sum_q24 = phase_map_scale(&machine_tables.torque_format, sum);
+    measured->torque_sum_q24 =
+        fixed_multiply_shift(phase_map_scale(&machine_tables.torque_format, sum), state->table_scale.scale_q30, 30);
 }

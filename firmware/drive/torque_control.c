@@ -73,6 +73,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
     const int32_t trimmed_q24 = torque_trim_step(&parameters->trim, &state->trim, state->torque_reference_q24,
                                                  measured->torque_sum_q24, voltage_limited);
+    const table_scale_factors_t *scale = &state->table_scale;
     const conduction_t *conduction =
         conduction_angles(&parameters->conduction, &state->deferred.conduction, deferred->predictive.conduction);
     const predictive_torque_sample_t sample = {
@@ -82,7 +83,9 @@ static void predictive_control(const control_parameters_t *parameters, control_s
         .angle = angle_in_two_periods * rotor_poles,
         .misalignment = deferred->predictive.misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
-        .torque_q24 = fixed_add(trimmed_q24, conduction->ripple_q24),
+        .torque_q24 = fixed_multiply_shift(fixed_add(trimmed_q24, conduction->ripple_q24), scale->inverse_q30, 30),
+        .flux_observer = &scale->flux,
+        .period_q40 = scale->period_q40,
         .lost_phase = state->lost_phase,
         .reverse = observer->speed_q22 < 0,
         .angle_step = (uint32_t)fixed_abs(step) * rotor_poles,

@@ -80,6 +80,7 @@ ParameterName = Literal[
     "winding_limit_C",
     "inverter_limit_C",
     "degraded_running",
+    "table_scale",
 ]
 
 TelemetryName = Literal[
@@ -321,6 +322,10 @@ TelemetryName = Literal[
     "DRIVE_DEGRADED.torque_least_Nm",
     "torque_here_Nm",
     "DRIVE_DEGRADED.torque_here_Nm",
+    "table_scale",
+    "DRIVE_ESTIMATES.table_scale",
+    "resistance_ohm",
+    "DRIVE_ESTIMATES.resistance_ohm",
     "operation",
     "PARAMETER_RESPONSE.operation",
     "index",

@@ -165,6 +165,8 @@ TABLES = Structure("machine_tables_t", (
                                   machine.converter["diode_resistance_ohm"]) / machine.resistance_ohm), 8, 17)),
     Member("minimum_pulse_ns", "uint16_t", lambda machine, scaling, tables: quantise(
         machine.converter["minimum_pulse_ns"], 0, 17)),
+    Member("device_drop_q6", "uint16_t", lambda machine, scaling, tables: quantise(
+        machine.converter["switch_drop_V"] + machine.converter["diode_drop_V"], 6 - scaling.exponents.voltage, 17)),
     Member("current_slew_rate_A_s", "int32_t", lambda machine, scaling, tables: quantise(
         machine.current_rise_A_s, -scaling.exponents.current, 32)),
     Member("fold_back_q6", "uint16_t", lambda machine, scaling, tables: quantise(

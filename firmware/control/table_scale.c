@@ -1,0 +1,154 @@
+#include "control/table_scale.h"
+
+#include "fixed/compiler.h"
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+/* Sums of (1) and (2) forget a sixteenth with each interval. */
+#define FORGET_BITS 4
+
+/* Coarser sums, so that sixteen intervals of the largest current for half a second fit. */
+#define ENERGY_COARSER 9
+#define SQUARE_COARSER 8
+#define CHARGE_COARSER 9
+#define FLUX_COARSER 8
+
+/* Values to divide are scaled below 2^SCALED_BITS. */
+#define SCALED_BITS 30
+
+/* Least work of an interval, part of its largest current times its largest flux linkage: of less, as of a phase that
+ * drives and brakes in turn, the ratio says little. */
+#define WORK_SHIFT 3
+
+static int32_t multiply_q30(int32_t value, int32_t factor_q30) {
+    return fixed_multiply(value, factor_q30, 30);
+}
+
+COLD void table_scale_reset(table_scale_t *scale) {
+    *scale = (table_scale_t){.scale_q30 = TABLE_SCALE_ONE_Q30, .smooth_q30 = TABLE_SCALE_ONE_Q30};
+}
+
+COLD table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period_q40,
+                                               const flux_observer_parameters_t *flux) {
+    const int32_t inverse_q30 = fixed_saturate(fixed_divide((INT64_C(1) << 60) + scale_q30 / 2, scale_q30));
+    return (table_scale_factors_t){
+        .scale_q30 = scale_q30,
+        .inverse_q30 = inverse_q30,
+        .period_q40 = multiply_q30(period_q40, inverse_q30),
+        .flux = {.gain_q30 = flux->gain_q30,
+                 .resistance_period_q40 = multiply_q30(flux->resistance_period_q40, inverse_q30)},
+    };
+}
+
+static uint64_t magnitude(int64_t value) {
+    return value < 0 ? (uint64_t)-value : (uint64_t)value;
+}
+
+/* Weighted flux linkage over weighted charge, as a resistance times Ts, ohm s, Q-9.40; charge > 0. */
+static int32_t resistance_q40(int64_t flux, int64_t charge) {
+    unsigned shift = 0;
+    while (charge >> shift >> SCALED_BITS != 0) {
+        shift++;
+    }
+    const int64_t scaled = fixed_clamp_64(flux >> shift, -(INT64_C(1) << 42), INT64_C(1) << 42);
+    return fixed_saturate(fixed_divide(scaled * (1 << 20), (charge >> shift) + 1));
+}
+
+/* s and R - R0 from the sums, unless these do not tell. */
+static void solve(table_scale_t *scale) {
+    if (scale->charge <= 0) {
+        return;
+    }
+    const int32_t by_voltage_q40 = resistance_q40(scale->end, scale->charge);
+    const int32_t by_table_q40 = resistance_q40(scale->end_table, scale->charge);
+    unsigned shift = 0;
+    while ((magnitude(scale->applied_q30) | magnitude(scale->table_q30) | magnitude(scale->square_q10)) >> shift >>
+               SCALED_BITS !=
+           0) {
+        shift++;
+    }
+    /* Q10 Q40 to Q30. */
+    const int32_t square = (int32_t)(scale->square_q10 >> shift);
+    const int64_t applied = (scale->applied_q30 >> shift) - (fixed_product(square, by_voltage_q40) >> 20);
+    const int64_t table = (scale->table_q30 >> shift) - (fixed_product(square, by_table_q40) >> 20);
+    if (table <= scale->table_q30 >> shift >> 1 || applied <= 0 || applied >> 32 != 0) {
+        return;
+    }
+    const int32_t found_q30 = fixed_saturate(fixed_divide(applied << 30, table));
+    scale->scale_q30 = fixed_clamp(found_q30, TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
+    scale->resistance_q40 = fixed_subtract(by_voltage_q40, multiply_q30(by_table_q40, scale->scale_q30));
+}
+
+static void add_to(int64_t *sum, int64_t value) {
+    *sum += value - (*sum >> FORGET_BITS);
+}
+
+/* Ends the interval of a phase. */
+static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t least_q9) {
+    const int64_t most_q39 = fixed_product(phase->most_q9, phase->most_q29) * 2;
+    if (phase->most_q9 < least_q9 || magnitude(phase->table_q39) < (uint64_t)(most_q39 >> WORK_SHIFT)) {
+        return;
+    }
+    const int64_t sign = phase->table_q39 < 0 ? -1 : 1;
+    const int32_t charge = (int32_t)(phase->end_charge_q10 >> CHARGE_COARSER);
+    add_to(&scale->applied_q30, sign * (phase->applied_q39 >> ENERGY_COARSER));
+    add_to(&scale->table_q30, sign * (phase->table_q39 >> ENERGY_COARSER));
+    add_to(&scale->square_q10, sign * (phase->square_q18 >> SQUARE_COARSER));
+    add_to(&scale->end, fixed_product(charge, phase->end_q29 >> FLUX_COARSER));
+    add_to(&scale->end_table, fixed_product(charge, phase->end_table_q29 >> FLUX_COARSER));
+    add_to(&scale->charge, fixed_product(charge, charge));
+    if (scale->intervals < TABLE_SCALE_INTERVALS_MIN) {
+        scale->intervals++;
+    }
+    if (scale->intervals >= TABLE_SCALE_INTERVALS_MIN) {
+        solve(scale);
+    }
+}
+
+/* Longest interval: half a second at 100 kHz of the largest current. */
+#define CHARGE_MAX_Q10 (INT64_C(1) << 40)
+
+/* Trapezoidal rule; the square of a current that changes linearly. */
+static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sample) {
+    const int32_t before_q9 = phase->current_q9, now_q9 = sample->current_q9;
+    const int32_t twice_q9 = before_q9 + now_q9;
+    /* Drops are there with the current: from about the middle of the interval in which it begins. */
+    phase->drops_q29 = fixed_add(phase->drops_q29, before_q9 > 0 ? sample->drop_q29 : sample->drop_q29 / 2);
+    const int32_t flux_q29 = fixed_subtract(sample->flux_q29, phase->drops_q29);
+    const int64_t periods = sample->periods;
+    phase->applied_q39 += fixed_product(twice_q9, fixed_subtract(flux_q29, phase->flux_q29));
+    phase->table_q39 += fixed_product(twice_q9, fixed_subtract(sample->table_q29, phase->table_q29));
+    phase->charge_q10 += twice_q9 * periods;
+    phase->square_q18 += ((int64_t)twice_q9 * twice_q9 - (int64_t)before_q9 * now_q9) / 3 * periods;
+    phase->current_q9 = now_q9;
+    phase->flux_q29 = flux_q29;
+    phase->table_q29 = sample->table_q29;
+    phase->most_q9 = now_q9 > phase->most_q9 ? now_q9 : phase->most_q9;
+    phase->most_q29 = sample->table_q29 > phase->most_q29 ? sample->table_q29 : phase->most_q29;
+}
+
+COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scale_sample_t *sample, int32_t least_q9) {
+    table_scale_phase_t *phase = &scale->phase[index];
+    if (sample->zero) {
+        if (phase->whole) {
+            end(scale, phase, least_q9);
+        }
+        *phase = (table_scale_phase_t){.whole = true};
+        return;
+    }
+    phase->whole = phase->whole && sample->known && phase->charge_q10 < CHARGE_MAX_Q10;
+    if (!phase->whole) {
+        return;
+    }
+    integrate(phase, sample);
+    phase->emptied = phase->emptied || sample->emptied;
+    if (!phase->emptied) {
+        phase->end_q29 = phase->flux_q29;
+        phase->end_table_q29 = sample->table_q29;
+        phase->end_charge_q10 = phase->charge_q10;
+    }
+}
+
+COLD void table_scale_follow(table_scale_t *scale, int32_t part_q31) {
+    scale->smooth_q30 += fixed_multiply(fixed_subtract(scale->scale_q30, scale->smooth_q30), part_q31, 31);
+}
