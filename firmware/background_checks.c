@@ -30,6 +30,7 @@ typedef struct {
     stall_input_t stall;
     phase_monitor_input_t phases;
     uint32_t encoder_angle;
+    int32_t flux_q29[HAL_PHASES_MAX]; /* as in phases, but below 0 where the integral is */
 } sample_t;
 
 COLD static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
@@ -48,8 +49,9 @@ COLD static bool read_sample(const control_state_t *control, const control_param
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             input->misalignment[phase] = misalignment[phase];
             input->current_q9[phase] = measured->current_q9[phase];
-            input->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
-            input->next_q29[phase] = control->applied_flux.next_q29[phase];
+            sample->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
+            input->flux_q29[phase] = fixed_non_negative(sample->flux_q29[phase]);
+            input->next_q29[phase] = fixed_non_negative(control->applied_flux.next_q29[phase]);
             input->off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
         }
         read_stall_input(control, &sample->stall);
@@ -158,8 +160,9 @@ static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *inp
 
 /* Scale of the tables, by the state of the phases after their check. An integral that is 0 with a current has been
  * limited there. */
-static void follow_table_scale(drive_t *drive, const phase_monitor_input_t *input,
-                               const encoder_monitor_input_t *encoder, uint32_t elapsed) {
+static void follow_table_scale(drive_t *drive, const sample_t *sampled, const encoder_monitor_input_t *encoder,
+                               const int32_t followed_q29[HAL_PHASES_MAX], uint32_t elapsed) {
+    const phase_monitor_input_t *input = &sampled->phases;
     const control_parameters_t *parameters = &drive->control_parameters;
     const int32_t period_q40 = parameters->predictive.period_q40;
     const int32_t periods = (int32_t)(elapsed & 0xffu);
@@ -167,20 +170,20 @@ static void follow_table_scale(drive_t *drive, const phase_monitor_input_t *inpu
         const phase_monitor_phase_t *state = &drive->phases.phase[phase];
         const table_scale_sample_t sample = {
             .current_q9 = input->current_q9[phase],
-            .flux_q29 = encoder->flux_q29[phase],
+            .flux_q29 = fixed_subtract(sampled->flux_q29[phase], followed_q29[phase]),
             .table_q29 = state->table_q29,
             .periods = (uint32_t)periods,
             .drop_q29 = applied_flux_period_q29(machine_tables.device_drop_q6, period_q40) * periods,
             .zero = state->zero_at == input->periods,
             .known = encoder->known[phase],
-            .emptied = input->flux_q29[phase] == 0,
+            .emptied = sampled->flux_q29[phase] == 0,
         };
         table_scale_add(&drive->table_scale, phase, &sample, machine_tables.current_range_q9 / 32);
     }
     table_scale_follow(&drive->table_scale, parameters->table_scale_part_q31 * periods);
     const bool follows = parameters->table_scale_part_q31 != 0;
-    const table_scale_factors_t factors =
-        table_scale_factors(follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &parameters->predictive.flux);
+    const table_scale_factors_t factors = table_scale_factors(
+        follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &parameters->predictive.flux);
     hal_critical_enter(drive->hal);
     drive->control.table_scale = factors;
     hal_critical_leave(drive->hal);
@@ -191,7 +194,10 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const phase_monitor_input_t *input = &sample->phases;
     const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle, &sample->stall);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
-    int32_t correction_q29[HAL_PHASES_MAX];
+    int32_t correction_q29[HAL_PHASES_MAX], followed_q29[HAL_PHASES_MAX];
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        followed_q29[phase] = drive->phases.phase[phase].followed_q29;
+    }
     const uint32_t elapsed = input->periods - drive->phases.periods;
     const uint32_t step = (uint32_t)fixed_abs((int32_t)(input->electrical - drive->phases.electrical));
     uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
@@ -202,7 +208,7 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
         follow_misalignment(drive, input, &encoder, elapsed);
     }
     if (input->run) {
-        follow_table_scale(drive, input, &encoder, elapsed);
+        follow_table_scale(drive, sample, &encoder, followed_q29, elapsed);
     }
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
@@ -212,8 +218,11 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
+        const bool none =
+            input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
         hal_critical_enter(drive->hal);
-        *next_q29 = fixed_non_negative(fixed_add(*next_q29, correction_q29[phase]));
+        const int32_t corrected_q29 = fixed_add(*next_q29, correction_q29[phase]);
+        *next_q29 = none ? fixed_non_negative(corrected_q29) : corrected_q29;
         hal_critical_leave(drive->hal);
     }
     return failed;

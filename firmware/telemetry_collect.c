@@ -64,10 +64,10 @@ static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry)
 /* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
 static void collect_estimates(const drive_t *drive, drive_telemetry_t *telemetry) {
     const int64_t error_q40 = (int64_t)drive->table_scale.resistance_q40 * drive->control_rate_hz;
-    const int32_t resistance_q24 =
-        fixed_saturate(drive->parameters.values[PARAMETER_RESISTANCE_OHM] + fixed_shift(error_q40, 16));
-    telemetry->estimates.table_scale = (uint32_t)fixed_shift(drive->control.table_scale.scale_q30, 15);
-    telemetry->estimates.resistance_ohm = (uint32_t)fixed_non_negative(resistance_q24);
+    const int32_t resistance_q16 =
+        fixed_saturate(fixed_shift(drive->parameters.values[PARAMETER_RESISTANCE_OHM] + (error_q40 >> 16), 8));
+    telemetry->estimates.table_scale = (uint32_t)((1 << 15) + fixed_shift(drive->control.table_scale.excess_q31, 16));
+    telemetry->estimates.resistance_ohm = (uint32_t)fixed_non_negative(resistance_q16);
 }
 
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {

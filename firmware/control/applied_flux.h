@@ -1,11 +1,13 @@
 /* Flux linkage that the applied voltage has built up in each phase: the integral of Faraday's law alone, from the
  * duties, whatever the current sensors say but for the resistive drop.
  *
- *   psi(k+1) = max(0, psi(k) + Ts (duty Vdc - R i))       forward Euler; the diodes block reverse current
+ *   psi(k+1) = psi(k) + Ts (duty Vdc - R i)               forward Euler
+ *   psi(k+1) = max(0, psi(k+1))                           without current: the diodes block a reverse one
  *
  * Both switches off are the duty -1: full opposite voltage until the flux linkage has gone. A phase that is off once in
  * an electrical revolution begins at 0 each time. Drops of the devices and errors of R and Vdc accumulate; the caller
- * corrects the integral by what it knows of the flux linkage (drive/phase_monitor.h). */
+ * corrects the integral by what it knows of the flux linkage (drive/phase_monitor.h). While there is current it may
+ * fall below 0: that is what the error of R is known by (table_scale.h). */
 #ifndef CONTROL_APPLIED_FLUX_H
 #define CONTROL_APPLIED_FLUX_H
 
@@ -17,8 +19,8 @@
 #include "hal.h"
 
 typedef struct {
-    int32_t at_sample_q29[HAL_PHASES_MAX]; /* at the last sample, Wb, Q2.29, >= 0 */
-    int32_t next_q29[HAL_PHASES_MAX];      /* at the coming sample, Wb, Q2.29, >= 0 */
+    int32_t at_sample_q29[HAL_PHASES_MAX]; /* at the last sample, Wb, Q2.29 */
+    int32_t next_q29[HAL_PHASES_MAX];      /* at the coming sample, Wb, Q2.29 */
 } applied_flux_t;
 
 /* Vdc Ts, Wb, Q2.29. dc_link_voltage_q6: V, Q9.6, below 2^16; period_q40: Ts, s, Q-9.40. */
@@ -33,6 +35,9 @@ static inline int32_t applied_flux_shortest_pulse_q29(int32_t period_flux_q29, u
     const uint32_t part_q14 = minimum_pulse_ns * rate_kHz / 61u; /* 10^6 / 2^14 = 61 */
     return fixed_multiply(period_flux_q29, (int32_t)part_q14, 14);
 }
+
+/* Part of the sensors' range that is no current: an error of twice that is a fault of a sensor (phase_monitor.h). */
+#define APPLIED_FLUX_NO_CURRENT 64u
 
 /* Resistance of a winding, of which the drive knows neither temperature nor tolerance: copper is 0.75 of its value at
  * 25 C at -40 C, and 1.5 times it at 155 C ((235 C + T) / 260 K, IEC 60034-1), and 6 % remain for the winding itself:
@@ -69,12 +74,15 @@ static inline int64_t applied_flux_independent(int64_t a, int64_t b) {
 typedef struct {
     int32_t full_q32;    /* Vdc Ts, Wb */
     int32_t against_q40; /* -R Ts, ohm s */
+    int32_t none_q9;     /* current up to which there is none, A */
 } applied_flux_period_t;
 
-/* dc_link_voltage_q6, period_q40: as above; the product below 2^27. resistance_period_q40: R Ts, ohm s, Q-9.40. */
+/* dc_link_voltage_q6, period_q40: as above; the product below 2^27. resistance_period_q40: R Ts, ohm s, Q-9.40.
+ * current_range_q9: of the sensors, A, Q7.9, of which 1/64 is no current. */
 ALWAYS_INLINE applied_flux_period_t applied_flux_period(int32_t dc_link_voltage_q6, int32_t period_q40,
-                                                        int32_t resistance_period_q40) {
-    return (applied_flux_period_t){applied_flux_period_q29(dc_link_voltage_q6, period_q40) * 8, -resistance_period_q40};
+                                                        int32_t resistance_period_q40, uint32_t current_range_q9) {
+    return (applied_flux_period_t){applied_flux_period_q29(dc_link_voltage_q6, period_q40) * 8, -resistance_period_q40,
+                                   (int32_t)(current_range_q9 / APPLIED_FLUX_NO_CURRENT)};
 }
 
 /* One period of a phase, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A,
@@ -86,7 +94,7 @@ ALWAYS_INLINE void applied_flux_step(applied_flux_t *flux, const applied_flux_pe
     const int32_t change_q29 = fixed_multiply_high_add(gained_q29, current_q9 << 12, period->against_q40);
     const int32_t then_q29 = fixed_add(now_q29, change_q29);
     flux->at_sample_q29[phase] = now_q29;
-    flux->next_q29[phase] = fixed_non_negative(then_q29);
+    flux->next_q29[phase] = current_q9 > period->none_q9 ? then_q29 : fixed_non_negative(then_q29);
 }
 
 #endif

@@ -194,9 +194,8 @@ static inline int32_t removable_flux(const period_t *period, uint32_t travel) {
 }
 
 /* Predicts the flux linkage of a phase and which flux linkages the coming period can reach from there. */
-static inline void predict_flux(predictive_torque_t *control,
-                                const predictive_torque_sample_t *sample, unsigned phase, int32_t flux_step_max_q29,
-                                unsigned flux_shift, plan_t *p) {
+static inline void predict_flux(predictive_torque_t *control, const predictive_torque_sample_t *sample, unsigned phase,
+                                int32_t flux_step_max_q29, unsigned flux_shift, plan_t *p) {
     int32_t *flux_q29 = &control->flux_q29[phase];
     /* Q15 * Q29 to Q29. */
     const int32_t applied_q29 = fixed_multiply_high(control->duty_q15[phase] * (1 << 14), flux_step_max_q29 << 3);
@@ -291,9 +290,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     /* At most HAL_PHASES_MAX; the compiler needs to see it where it unrolls loops without knowing the tables. */
     const unsigned phases = tables->phases < HAL_PHASES_MAX ? tables->phases : HAL_PHASES_MAX;
     /* Vdc Ts: Q6 * Q40 to Q29. */
-    const int32_t flux_step_max_q29 =
-        fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, sample->period_q40), FLUX_STEP_MIN_Q29,
-                    FLUX_STEP_LIMIT_Q29);
+    const int32_t flux_step_max_q29 = fixed_clamp(fixed_multiply_high(sample->bus_voltage_q6 << 15, sample->period_q40),
+                                                  FLUX_STEP_MIN_Q29, FLUX_STEP_LIMIT_Q29);
 
     const unsigned torque_shift = tables->torque_format.result_shift;
     const unsigned flux_shift = tables->flux_format.result_shift;

@@ -82,7 +82,7 @@ typedef struct {
     uint32_t angle_step;            /* magnitude of the rotation per period, 2^-32 electrical rev */
     const flux_observer_parameters_t *flux_observer; /* with the resistance, and the period, over the scale of the
                                                       * tables, table_scale.h */
-    int32_t period_q40;             /* s, Q-9.40 */
+    int32_t period_q40;                              /* s, Q-9.40 */
 } predictive_torque_sample_t;
 
 /* Flux linkages and duties 0. */

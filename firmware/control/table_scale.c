@@ -32,8 +32,8 @@ COLD table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period
                                                const flux_observer_parameters_t *flux) {
     const int32_t inverse_q30 = fixed_saturate(fixed_divide((INT64_C(1) << 60) + scale_q30 / 2, scale_q30));
     return (table_scale_factors_t){
-        .scale_q30 = scale_q30,
-        .inverse_q30 = inverse_q30,
+        .excess_q31 = 2 * (scale_q30 - TABLE_SCALE_ONE_Q30),
+        .inverse_excess_q31 = 2 * (inverse_q30 - TABLE_SCALE_ONE_Q30),
         .period_q40 = multiply_q30(period_q40, inverse_q30),
         .flux = {.gain_q30 = flux->gain_q30,
                  .resistance_period_q40 = multiply_q30(flux->resistance_period_q40, inverse_q30)},
@@ -90,12 +90,12 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
         return;
     }
     const int64_t sign = phase->table_q39 < 0 ? -1 : 1;
-    const int32_t charge = (int32_t)(phase->end_charge_q10 >> CHARGE_COARSER);
+    const int32_t charge = (int32_t)(phase->charge_q10 >> CHARGE_COARSER);
     add_to(&scale->applied_q30, sign * (phase->applied_q39 >> ENERGY_COARSER));
     add_to(&scale->table_q30, sign * (phase->table_q39 >> ENERGY_COARSER));
     add_to(&scale->square_q10, sign * (phase->square_q18 >> SQUARE_COARSER));
-    add_to(&scale->end, fixed_product(charge, phase->end_q29 >> FLUX_COARSER));
-    add_to(&scale->end_table, fixed_product(charge, phase->end_table_q29 >> FLUX_COARSER));
+    add_to(&scale->end, fixed_product(charge, phase->flux_q29 >> FLUX_COARSER));
+    add_to(&scale->end_table, fixed_product(charge, phase->table_q29 >> FLUX_COARSER));
     add_to(&scale->charge, fixed_product(charge, charge));
     if (scale->intervals < TABLE_SCALE_INTERVALS_MIN) {
         scale->intervals++;
@@ -140,12 +140,9 @@ COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scal
     if (!phase->whole) {
         return;
     }
-    integrate(phase, sample);
-    phase->emptied = phase->emptied || sample->emptied;
+    phase->emptied = phase->emptied || (sample->emptied && phase->current_q9 > 0);
     if (!phase->emptied) {
-        phase->end_q29 = phase->flux_q29;
-        phase->end_table_q29 = sample->table_q29;
-        phase->end_charge_q10 = phase->charge_q10;
+        integrate(phase, sample);
     }
 }
 

@@ -29,6 +29,8 @@
 #include <stdint.h>
 
 #include "control/flux_observer.h"
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
 #include "hal.h"
 
 #define TABLE_SCALE_ONE_Q30 (1 << 30)
@@ -37,17 +39,15 @@
 
 /* Of a phase; all zero at the start. */
 typedef struct {
-    bool whole;                       /* sampled since its current was zero */
-    bool emptied;                     /* the voltage's integral has ended at 0 before the current */
-    int32_t drops_q29;                /* integral of the devices' drops, Wb, Q2.29 */
-    int32_t current_q9;               /* at the last sample, A, Q7.9 */
-    int32_t flux_q29, table_q29;      /* at the last sample, Wb, Q2.29 */
-    int32_t most_q9, most_q29;        /* largest current, and flux linkage by the tables */
-    int64_t applied_q39, table_q39;   /* integrals of i dpsi by voltage and tables, J */
-    int64_t charge_q10;               /* of i, A periods */
-    int64_t square_q18;               /* of i^2, A^2 periods */
-    int32_t end_q29, end_table_q29;   /* flux linkages at the last sample with a current, and the charge there */
-    int64_t end_charge_q10;
+    bool whole;                     /* sampled since its current was zero */
+    bool emptied;                   /* the voltage's integral has ended at 0 before the current */
+    int32_t drops_q29;              /* integral of the devices' drops, Wb, Q2.29 */
+    int32_t current_q9;             /* at the last sample, A, Q7.9 */
+    int32_t flux_q29, table_q29;    /* at the last sample, Wb, Q2.29 */
+    int32_t most_q9, most_q29;      /* largest current, and flux linkage by the tables */
+    int64_t applied_q39, table_q39; /* integrals of i dpsi by voltage and tables, J */
+    int64_t charge_q10;             /* of i, A periods */
+    int64_t square_q18;             /* of i^2, A^2 periods */
 } table_scale_phase_t;
 
 /* All zero but for `scale_q30` and `smooth_q30`, 1, at the start. */
@@ -65,28 +65,34 @@ typedef struct {
 #define TABLE_SCALE_INTERVALS_MIN 4u
 
 typedef struct {
-    int32_t current_q9;    /* A, Q7.9 */
-    int32_t flux_q29;      /* by the voltage since the phase was without current, Wb, Q2.29 */
-    int32_t table_q29;     /* by the tables, Wb, Q2.29 */
-    uint32_t periods;      /* control periods since the last sample */
-    int32_t drop_q29;      /* drops of the devices times that time, Wb, Q2.29 */
-    bool zero;             /* the phase is off and has no current */
-    bool known;            /* flux_q29 is whole: no period was lost */
-    bool emptied;          /* the integral of the voltage has been limited to 0 */
+    int32_t current_q9; /* A, Q7.9 */
+    int32_t flux_q29;   /* by the voltage since the phase was without current, Wb, Q2.29 */
+    int32_t table_q29;  /* by the tables, Wb, Q2.29 */
+    uint32_t periods;   /* control periods since the last sample */
+    int32_t drop_q29;   /* drops of the devices times that time, Wb, Q2.29 */
+    bool zero;          /* the phase is off and has no current */
+    bool known;         /* flux_q29 is whole: no period was lost */
+    bool emptied;       /* the integral of the voltage has been limited to 0 */
 } table_scale_sample_t;
 
 /* What the interrupt needs: with voltages and resistances over s the flux linkages of predictive_torque.h are those of
  * the tables. */
 typedef struct {
-    int32_t scale_q30;   /* s, Q1.30 */
-    int32_t inverse_q30; /* 1 / s, Q1.30 */
-    int32_t period_q40;  /* Ts / s, s, Q-9.40 */
+    int32_t excess_q31;              /* s - 1, Q0.31 */
+    int32_t inverse_excess_q31;      /* 1 / s - 1, Q0.31 */
+    int32_t period_q40;              /* Ts / s, s, Q-9.40 */
     flux_observer_parameters_t flux; /* with R Ts / s */
 } table_scale_factors_t;
 
 /* Factors for a scale from TABLE_SCALE_MIN_Q30 to TABLE_SCALE_MAX_Q30; rounded to nearest. [background] */
 table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period_q40,
                                           const flux_observer_parameters_t *flux);
+
+/* Torque times a factor, of which excess_q31 is what it exceeds 1 by, Q0.31: rounded to 2 LSB, saturated; exact for a
+ * factor of 1. Two instructions. */
+ALWAYS_INLINE int32_t table_scale_multiply(int32_t torque_q24, int32_t excess_q31) {
+    return fixed_add_twice(torque_q24, fixed_multiply_high(torque_q24, excess_q31));
+}
 
 /* No interval, scale 1. */
 void table_scale_reset(table_scale_t *scale);

@@ -53,7 +53,7 @@ static void measure_phases(const control_parameters_t *parameters, const control
     control_measurement_t *measured = &state->measurement;
     const applied_flux_period_t period =
         applied_flux_period(measured->dc_link_voltage_q6, parameters->predictive.period_q40,
-                            parameters->predictive.flux.resistance_period_q40);
+                            parameters->predictive.flux.resistance_period_q40, machine_tables.current_range_q9);
     const int32_t scale_q18 = parameters->current_scale_q18;
     const unsigned phases = machine_tables.phases;
     int32_t max_q9 = 0;
@@ -123,5 +123,5 @@ void measure_torque(const control_parameters_t *parameters, control_state_t *sta
         sum = torque_by_map(parameters, misalignment, measured);
     }
     measured->torque_sum_q24 =
-        fixed_multiply_shift(phase_map_scale(&machine_tables.torque_format, sum), state->table_scale.scale_q30, 30);
+        table_scale_multiply(phase_map_scale(&machine_tables.torque_format, sum), state->table_scale.excess_q31);
 }

@@ -83,7 +83,7 @@ static void predictive_control(const control_parameters_t *parameters, control_s
         .angle = angle_in_two_periods * rotor_poles,
         .misalignment = deferred->predictive.misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
-        .torque_q24 = fixed_multiply_shift(fixed_add(trimmed_q24, conduction->ripple_q24), scale->inverse_q30, 30),
+        .torque_q24 = table_scale_multiply(fixed_add(trimmed_q24, conduction->ripple_q24), scale->inverse_excess_q31),
         .flux_observer = &scale->flux,
         .period_q40 = scale->period_q40,
         .lost_phase = state->lost_phase,
