@@ -158,25 +158,32 @@ static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *inp
     }
 }
 
-/* Scale of the tables, by the state of the phases after their check. An integral that is 0 with a current has been
- * limited there. */
-static void follow_table_scale(drive_t *drive, const sample_t *sampled, const encoder_monitor_input_t *encoder,
-                               const int32_t followed_q29[HAL_PHASES_MAX], uint32_t elapsed) {
-    const phase_monitor_input_t *input = &sampled->phases;
+/* As in the integral of the voltage. */
+static bool no_current(const phase_monitor_input_t *input, unsigned phase) {
+    return input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
+}
+
+/* Scale of the tables. After the check of the phases, whose corrections are in the integrals of the next sample. */
+static void follow_table_scale(drive_t *drive, const sample_t *sampled, const int32_t correction_q29[HAL_PHASES_MAX],
+                               uint32_t elapsed, bool lost) {
     const control_parameters_t *parameters = &drive->control_parameters;
+    const phase_monitor_input_t *input = &sampled->phases;
     const int32_t period_q40 = parameters->predictive.period_q40;
     const int32_t periods = (int32_t)(elapsed & 0xffu);
+    const int32_t removable_q29 = 2 * (int32_t)(parameters->initialise_ticks / CHECKS_PER_MS) * input->period_flux_q29;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         const phase_monitor_phase_t *state = &drive->phases.phase[phase];
+        drive->conduction_ends |= input->off[phase] && !no_current(input, phase) && state->table_q29 < removable_q29;
         const table_scale_sample_t sample = {
             .current_q9 = input->current_q9[phase],
-            .flux_q29 = fixed_subtract(sampled->flux_q29[phase], followed_q29[phase]),
+            .flux_q29 = sampled->flux_q29[phase],
+            .correction_q29 = correction_q29[phase],
             .table_q29 = state->table_q29,
             .periods = (uint32_t)periods,
             .drop_q29 = applied_flux_period_q29(machine_tables.device_drop_q6, period_q40) * periods,
-            .zero = state->zero_at == input->periods,
-            .known = encoder->known[phase],
-            .emptied = sampled->flux_q29[phase] == 0,
+            .zero = state->zero_at == input->periods && no_current(input, phase),
+            .none = no_current(input, phase),
+            .lost = lost,
         };
         table_scale_add(&drive->table_scale, phase, &sample, machine_tables.current_range_q9 / 32);
     }
@@ -194,10 +201,7 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     const phase_monitor_input_t *input = &sample->phases;
     const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle, &sample->stall);
     encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
-    int32_t correction_q29[HAL_PHASES_MAX], followed_q29[HAL_PHASES_MAX];
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        followed_q29[phase] = drive->phases.phase[phase].followed_q29;
-    }
+    int32_t correction_q29[HAL_PHASES_MAX];
     const uint32_t elapsed = input->periods - drive->phases.periods;
     const uint32_t step = (uint32_t)fixed_abs((int32_t)(input->electrical - drive->phases.electrical));
     uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
@@ -207,8 +211,9 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
         follow_misalignment(drive, input, &encoder, elapsed);
     }
+    drive->conduction_ends = false;
     if (input->run) {
-        follow_table_scale(drive, sample, &encoder, followed_q29, elapsed);
+        follow_table_scale(drive, sample, correction_q29, elapsed, encoder.lost);
     }
     const uint32_t of_phases =
         (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
@@ -218,11 +223,9 @@ COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sa
     }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
-        const bool none =
-            input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
         hal_critical_enter(drive->hal);
         const int32_t corrected_q29 = fixed_add(*next_q29, correction_q29[phase]);
-        *next_q29 = none ? fixed_non_negative(corrected_q29) : corrected_q29;
+        *next_q29 = no_current(input, phase) ? fixed_non_negative(corrected_q29) : corrected_q29;
         hal_critical_leave(drive->hal);
     }
     return failed;
@@ -320,7 +323,7 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
 COLD void background_checks(drive_t *drive, uint32_t time_us) {
     follow_heat(drive, time_us);
     test_itself(drive, time_us);
-    const bool suspicious = drive->phases.suspicious || drive->encoder.suspicious;
+    const bool suspicious = drive->phases.suspicious || drive->encoder.suspicious || drive->conduction_ends;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
     if (unmasked_read_periods(&drive->control.deferred_request) - drive->phases.periods >= spacing) {
         check(drive, time_us);

@@ -60,6 +60,7 @@ typedef struct {
     phase_monitor_t phases;
     phase_balance_t balance;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
+    bool conduction_ends;      /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
     encoder_monitor_t encoder;

@@ -20,6 +20,10 @@
  * drives and brakes in turn, the ratio says little. */
 #define WORK_SHIFT 3
 
+/* Largest flux linkage at the last sample with a current, part of the largest one: with more (1) is hardly another
+ * equation than (2). */
+#define END_SHIFT 2
+
 static int32_t multiply_q30(int32_t value, int32_t factor_q30) {
     return fixed_multiply(value, factor_q30, 30);
 }
@@ -44,7 +48,7 @@ static uint64_t magnitude(int64_t value) {
     return value < 0 ? (uint64_t)-value : (uint64_t)value;
 }
 
-/* Weighted flux linkage over weighted charge, as a resistance times Ts, ohm s, Q-9.40; charge > 0. */
+/* Weighted flux linkage over weighted charge, as a resistance times Ts, ohm s, Q-9.40; 0 before the first interval. */
 static int32_t resistance_q40(int64_t flux, int64_t charge) {
     unsigned shift = 0;
     while (charge >> shift >> SCALED_BITS != 0) {
@@ -56,9 +60,6 @@ static int32_t resistance_q40(int64_t flux, int64_t charge) {
 
 /* s and R - R0 from the sums, unless these do not tell. */
 static void solve(table_scale_t *scale) {
-    if (scale->charge <= 0) {
-        return;
-    }
     const int32_t by_voltage_q40 = resistance_q40(scale->end, scale->charge);
     const int32_t by_table_q40 = resistance_q40(scale->end_table, scale->charge);
     unsigned shift = 0;
@@ -94,9 +95,11 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
     add_to(&scale->applied_q30, sign * (phase->applied_q39 >> ENERGY_COARSER));
     add_to(&scale->table_q30, sign * (phase->table_q39 >> ENERGY_COARSER));
     add_to(&scale->square_q10, sign * (phase->square_q18 >> SQUARE_COARSER));
-    add_to(&scale->end, fixed_product(charge, phase->flux_q29 >> FLUX_COARSER));
-    add_to(&scale->end_table, fixed_product(charge, phase->table_q29 >> FLUX_COARSER));
-    add_to(&scale->charge, fixed_product(charge, charge));
+    if (phase->table_q29 < phase->most_q29 >> END_SHIFT) {
+        add_to(&scale->end, fixed_product(charge, phase->flux_q29 >> FLUX_COARSER));
+        add_to(&scale->end_table, fixed_product(charge, phase->table_q29 >> FLUX_COARSER));
+        add_to(&scale->charge, fixed_product(charge, charge));
+    }
     if (scale->intervals < TABLE_SCALE_INTERVALS_MIN) {
         scale->intervals++;
     }
@@ -114,7 +117,7 @@ static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sa
     const int32_t twice_q9 = before_q9 + now_q9;
     /* Drops are there with the current: from about the middle of the interval in which it begins. */
     phase->drops_q29 = fixed_add(phase->drops_q29, before_q9 > 0 ? sample->drop_q29 : sample->drop_q29 / 2);
-    const int32_t flux_q29 = fixed_subtract(sample->flux_q29, phase->drops_q29);
+    const int32_t flux_q29 = fixed_subtract(fixed_subtract(sample->flux_q29, phase->corrections_q29), phase->drops_q29);
     const int64_t periods = sample->periods;
     phase->applied_q39 += fixed_product(twice_q9, fixed_subtract(flux_q29, phase->flux_q29));
     phase->table_q39 += fixed_product(twice_q9, fixed_subtract(sample->table_q29, phase->table_q29));
@@ -136,14 +139,15 @@ COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scal
         *phase = (table_scale_phase_t){.whole = true};
         return;
     }
-    phase->whole = phase->whole && sample->known && phase->charge_q10 < CHARGE_MAX_Q10;
+    phase->whole = phase->whole && !sample->lost && phase->charge_q10 < CHARGE_MAX_Q10;
     if (!phase->whole) {
         return;
     }
-    phase->emptied = phase->emptied || (sample->emptied && phase->current_q9 > 0);
-    if (!phase->emptied) {
+    phase->ended = phase->ended || (sample->none && phase->current_q9 > sample->current_q9);
+    if (!phase->ended) {
         integrate(phase, sample);
     }
+    phase->corrections_q29 = fixed_add(phase->corrections_q29, sample->correction_q29);
 }
 
 COLD void table_scale_follow(table_scale_t *scale, int32_t part_q31) {

@@ -39,8 +39,9 @@
 
 /* Of a phase; all zero at the start. */
 typedef struct {
+    bool ended;                     /* the current has fallen so far that the integral of the voltage is limited to 0 */
     bool whole;                     /* sampled since its current was zero */
-    bool emptied;                   /* the voltage's integral has ended at 0 before the current */
+    int32_t corrections_q29;        /* of the integral of the voltage, Wb, Q2.29 */
     int32_t drops_q29;              /* integral of the devices' drops, Wb, Q2.29 */
     int32_t current_q9;             /* at the last sample, A, Q7.9 */
     int32_t flux_q29, table_q29;    /* at the last sample, Wb, Q2.29 */
@@ -65,14 +66,15 @@ typedef struct {
 #define TABLE_SCALE_INTERVALS_MIN 4u
 
 typedef struct {
-    int32_t current_q9; /* A, Q7.9 */
-    int32_t flux_q29;   /* by the voltage since the phase was without current, Wb, Q2.29 */
-    int32_t table_q29;  /* by the tables, Wb, Q2.29 */
-    uint32_t periods;   /* control periods since the last sample */
-    int32_t drop_q29;   /* drops of the devices times that time, Wb, Q2.29 */
-    bool zero;          /* the phase is off and has no current */
-    bool known;         /* flux_q29 is whole: no period was lost */
-    bool emptied;       /* the integral of the voltage has been limited to 0 */
+    int32_t current_q9;     /* A, Q7.9 */
+    int32_t flux_q29;       /* by the voltage since the phase was without current, with all corrections, Wb, Q2.29 */
+    int32_t correction_q29; /* that is added to it after this sample, Wb, Q2.29 */
+    int32_t table_q29;      /* by the tables, Wb, Q2.29 */
+    uint32_t periods;       /* control periods since the last sample */
+    int32_t drop_q29;       /* drops of the devices times that time, Wb, Q2.29 */
+    bool zero;              /* the phase is off and has no current */
+    bool none;              /* no current, or so small a one that the integral is limited to 0 (applied_flux.h) */
+    bool lost;              /* control periods were lost since the last sample */
 } table_scale_sample_t;
 
 /* What the interrupt needs: with voltages and resistances over s the flux linkages of predictive_torque.h are those of
