@@ -78,7 +78,9 @@ struct placed_t {
                 .bus_voltage_q6 = int32_t(BUS_V * Q6),
                 .torque_q24 = torque_q24,
                 .reverse = false,
-                .angle_step = 0};
+                .angle_step = 0,
+                .flux_observer = &p.flux,
+                .period_q40 = p.period_q40};
     }
 };
 
@@ -165,7 +167,9 @@ class Machine {
             .bus_voltage_q6 = int32_t(BUS_V * Q6),
             .torque_q24 = reference_q24,
             .reverse = speed_rev < 0.0,
-            .angle_step = uint32_t(std::fabs(speed_rev) * REV)};
+            .angle_step = uint32_t(std::fabs(speed_rev) * REV),
+            .flux_observer = &parameters.flux,
+            .period_q40 = parameters.period_q40};
         std::copy_n(control.column, PHASES, expected_column);
         predictive_torque_step(&parameters, &control, &machine_tables, &sample, duty_q15);
         model.step(seen);
@@ -469,7 +473,9 @@ TEST(PredictiveTorque, a_misalignment_is_subtracted_from_the_angle_of_its_phase_
                                                    .bus_voltage_q6 = 240 * 64,
                                                    .torque_q24 = 8 << 24,
                                                    .reverse = false,
-                                                   .angle_step = 0};
+                                                   .angle_step = 0,
+                                                   .flux_observer = &p.flux,
+                                                   .period_q40 = p.period_q40};
         int32_t duty_q15[HAL_PHASES_MAX];
         predictive_torque_step(&p, control, &machine_tables, &sample, duty_q15);
         return control->cell[control->turn ^ 1u][0];
@@ -662,7 +668,9 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
                 .bus_voltage_q6 = voltages[random() % 4],
                 .torque_q24 = reference_q24,
                 .reverse = i % 2 == 0,
-                .angle_step = random_angle_step(random)};
+                .angle_step = random_angle_step(random),
+                .flux_observer = &p.flux,
+                .period_q40 = p.period_q40};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
             for (unsigned phase = 0; phase < PHASES; phase++) {
                 ASSERT_GE(duty_q15[phase], -32768);
