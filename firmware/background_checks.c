@@ -163,6 +163,32 @@ static bool no_current(const phase_monitor_input_t *input, unsigned phase) {
     return input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
 }
 
+/* By what the deferred step has found in windows of its own, read between two of its updates. */
+static int32_t factor_by_shaft_q30(drive_t *drive) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const deferred_t *deferred = &drive->control.deferred;
+    const inertia_t *inertia = &deferred->inertia;
+    const volatile uint32_t *updates = &inertia->updates;
+    const uint32_t before = *updates;
+    __atomic_signal_fence(__ATOMIC_ACQUIRE);
+    const shaft_torque_sample_t sample = {
+        .window = before >> parameters->inertia.window_shift,
+        .torque_variance_q14 = inertia->torque_variance_q14,
+        .acceleration_variance_q14 = inertia->acceleration_variance_q14,
+        .covariance_q14 = inertia->covariance_q14,
+        .counts = (deferred->mode == DRIVE_MODE_TORQUE || inertia->transient_windows > 0) && inertia->shift == 0 &&
+                  drive->table_scale.intervals >= TABLE_SCALE_INTERVALS_MIN,
+        .in_effect_q30 = drive->table_scale.smooth_q30,
+        .scale_q30 = drive->table_scale.scale_q30,
+    };
+    __atomic_signal_fence(__ATOMIC_ACQUIRE);
+    if (*updates == before) {
+        shaft_torque_step(&parameters->inertia, &drive->shaft_torque, &sample);
+    }
+    return parameters->scale_by_shaft && drive->shaft_torque.variance > 0 ? drive->shaft_torque.factor_q30
+                                                                          : TABLE_SCALE_ONE_Q30;
+}
+
 /* Scale of the tables. After the check of the phases, whose corrections are in the integrals of the next sample. */
 static void follow_table_scale(drive_t *drive, const sample_t *sampled, const int32_t correction_q29[HAL_PHASES_MAX],
                                uint32_t elapsed, bool lost) {
@@ -187,10 +213,16 @@ static void follow_table_scale(drive_t *drive, const sample_t *sampled, const in
         };
         table_scale_add(&drive->table_scale, phase, &sample, machine_tables.current_range_q9 / 32);
     }
-    table_scale_follow(&drive->table_scale, parameters->table_scale_part_q31 * periods);
+    table_scale_follow(&drive->table_scale, factor_by_shaft_q30(drive), parameters->table_scale_part_q31 * periods);
     const bool follows = parameters->table_scale_part_q31 != 0;
-    const table_scale_factors_t factors = table_scale_factors(
-        follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &parameters->predictive.flux);
+    flux_observer_parameters_t flux = parameters->predictive.flux;
+    const int32_t nominal_q40 = flux.resistance_period_q40;
+    if (follows) { /* from half of it to twice: copper from -70 to 280 C */
+        flux.resistance_period_q40 = fixed_clamp(fixed_add(nominal_q40, drive->table_scale.resistance_q40),
+                                                 nominal_q40 / 2, fixed_add(nominal_q40, nominal_q40));
+    }
+    const table_scale_factors_t factors =
+        table_scale_factors(follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &flux);
     hal_critical_enter(drive->hal);
     drive->control.table_scale = factors;
     hal_critical_leave(drive->hal);

@@ -7,6 +7,7 @@
 
 #include "comms/comms.h"
 #include "control/flux_angle.h"
+#include "control/shaft_torque.h"
 #include "control/table_scale.h"
 #include "drive/configure.h"
 #include "drive/control.h"
@@ -61,6 +62,7 @@ typedef struct {
     phase_balance_t balance;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
     bool conduction_ends;      /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
+    shaft_torque_t shaft_torque;
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
     encoder_monitor_t encoder;

@@ -150,6 +150,8 @@ COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scal
     phase->corrections_q29 = fixed_add(phase->corrections_q29, sample->correction_q29);
 }
 
-COLD void table_scale_follow(table_scale_t *scale, int32_t part_q31) {
-    scale->smooth_q30 += fixed_multiply(fixed_subtract(scale->scale_q30, scale->smooth_q30), part_q31, 31);
+COLD void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t part_q31) {
+    const int32_t target_q30 =
+        fixed_clamp(multiply_q30(scale->scale_q30, factor_q30), TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
+    scale->smooth_q30 += fixed_multiply(fixed_subtract(target_q30, scale->smooth_q30), part_q31, 31);
 }

@@ -107,7 +107,7 @@ static inline int32_t table_scale_part_q31(uint32_t control_rate_hz) {
     return (int32_t)((UINT32_C(1) << 31) / (control_rate_hz / 5u));
 }
 
-/* Moves smooth_q30 towards scale_q30 by a part of the difference, Q0.31. [background] */
-void table_scale_follow(table_scale_t *scale, int32_t part_q31);
+/* Moves smooth_q30 towards scale_q30 times a factor, Q1.30, by a part of the difference, Q0.31. [background] */
+void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t part_q31);
 
 #endif

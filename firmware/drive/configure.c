@@ -492,8 +492,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control.speed_reference_max_q22 = speed_reference_max_q22(&control.torque_mode, tables);
     control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
     control.encoder_monitor = encoder_monitor_from(&control, values, control_rate_hz);
-    control.table_scale_part_q31 =
-        values[PARAMETER_TABLE_SCALE] != 0 ? table_scale_part_q31(control_rate_hz) : 0;
+    control.table_scale_part_q31 = values[PARAMETER_TABLE_SCALE] != 0 ? table_scale_part_q31(control_rate_hz) : 0;
+    control.scale_by_shaft = values[PARAMETER_TABLE_SCALE] == 2;
     return control;
 }
 

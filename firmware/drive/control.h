@@ -102,6 +102,7 @@ typedef struct {
     slow_counts_parameters_t slow_counts;
     encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
     int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
+    bool scale_by_shaft;          /* and by the acceleration of the shaft, shaft_torque.h */
     degraded_parameters_t degraded;
     thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
     temperature_parameters_t temperature;
@@ -192,7 +193,7 @@ typedef struct {
     uint32_t lost_phase; /* number from 1 on of the phase whose switches stay open, as reported_fault_mask; 0: none */
     int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:
                                                   unknown */
-    int32_t torque_limit_q24; /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
+    int32_t torque_limit_q24;          /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
     table_scale_factors_t table_scale; /* written by the background with the interrupts masked */
 } control_state_t;
 

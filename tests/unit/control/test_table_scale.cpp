@@ -171,11 +171,11 @@ TEST_F(TableScale, is_used_from_the_fourth_interval_on_and_followed_slowly) {
     EXPECT_EQ(state.smooth_q30, TABLE_SCALE_ONE_Q30);
     const int32_t part_q31 = table_scale_part_q31(40000);
     for (int k = 0; k < 8000; k++) { // 0.2 s
-        table_scale_follow(&state, part_q31);
+        table_scale_follow(&state, TABLE_SCALE_ONE_Q30, part_q31);
     }
     EXPECT_NEAR(state.smooth_q30 / Q30, 1.2 - 0.2 / std::exp(1.0), 0.002);
     for (int k = 0; k < 40000; k++) {
-        table_scale_follow(&state, part_q31);
+        table_scale_follow(&state, TABLE_SCALE_ONE_Q30, part_q31);
     }
     EXPECT_NEAR(state.smooth_q30 / Q30, 1.2, 0.003);
 }
@@ -250,7 +250,7 @@ TEST(TableScaleSums, overflow_nothing) {
                 };
                 table_scale_add(&state, 3, &sample, LEAST_Q9);
             }
-            table_scale_follow(&state, table_scale_part_q31(20000) * 255);
+            table_scale_follow(&state, TABLE_SCALE_ONE_Q30, table_scale_part_q31(20000) * 255);
             ASSERT_GE(state.scale_q30, TABLE_SCALE_MIN_Q30);
             ASSERT_LE(state.scale_q30, TABLE_SCALE_MAX_Q30);
         }
