@@ -20,8 +20,8 @@
  * drives and brakes in turn, the ratio says little. */
 #define WORK_SHIFT 3
 
-/* Largest flux linkage at the last sample with a current, part of the largest one: with more (1) is hardly another
- * equation than (2). */
+/* Largest flux linkage of a sample for (1), part of the largest one: with more it is hardly another equation than (2).
+ */
 #define END_SHIFT 2
 
 static int32_t multiply_q30(int32_t value, int32_t factor_q30) {
@@ -91,14 +91,13 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
         return;
     }
     const int64_t sign = phase->table_q39 < 0 ? -1 : 1;
-    const int32_t charge = (int32_t)(phase->charge_q10 >> CHARGE_COARSER);
     add_to(&scale->applied_q30, sign * (phase->applied_q39 >> ENERGY_COARSER));
     add_to(&scale->table_q30, sign * (phase->table_q39 >> ENERGY_COARSER));
     add_to(&scale->square_q10, sign * (phase->square_q18 >> SQUARE_COARSER));
-    if (phase->table_q29 < phase->most_q29 >> END_SHIFT) {
-        add_to(&scale->end, fixed_product(charge, phase->flux_q29 >> FLUX_COARSER));
-        add_to(&scale->end_table, fixed_product(charge, phase->table_q29 >> FLUX_COARSER));
-        add_to(&scale->charge, fixed_product(charge, charge));
+    if (phase->tail_charge > 0) {
+        add_to(&scale->end, phase->tail);
+        add_to(&scale->end_table, phase->tail_table);
+        add_to(&scale->charge, phase->tail_charge);
     }
     if (scale->intervals < TABLE_SCALE_INTERVALS_MIN) {
         scale->intervals++;
@@ -107,6 +106,9 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
         solve(scale);
     }
 }
+
+/* Of the readings without a current, 2^8. */
+#define REST_BITS 8
 
 /* Longest interval: half a second at 100 kHz of the largest current. */
 #define CHARGE_MAX_Q10 (INT64_C(1) << 40)
@@ -130,13 +132,33 @@ static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sa
     phase->most_q29 = sample->table_q29 > phase->most_q29 ? sample->table_q29 : phase->most_q29;
 }
 
+/* What the sensor reads without a current: the least of the last readings, of which noise makes none larger. */
+static int32_t rest_q17(const table_scale_phase_t *phase, int32_t current_q9) {
+    const int32_t now_q17 = current_q9 * (1 << REST_BITS);
+    return now_q17 < phase->rest_q17 ? now_q17 : phase->rest_q17 + ((now_q17 - phase->rest_q17) >> REST_BITS);
+}
+
+/* Adds a sample near the end of the interval to (1). There flux linkage and current are in proportion, so that what a
+ * sensor reads without a current can be taken away from both. */
+static void close(table_scale_phase_t *phase, const table_scale_sample_t *sample) {
+    const int32_t current_q9 = sample->current_q9, rest_q9 = phase->rest_q17 >> REST_BITS;
+    if (current_q9 <= rest_q9 || phase->table_q29 >= phase->most_q29 >> END_SHIFT) {
+        return;
+    }
+    const int32_t charge = (int32_t)(phase->charge_q10 >> CHARGE_COARSER);
+    const int64_t table_q38 = fixed_product(phase->table_q29 >> FLUX_COARSER, current_q9 - rest_q9);
+    phase->tail += fixed_product(charge, phase->flux_q29 >> FLUX_COARSER);
+    phase->tail_table += fixed_product(charge, (int32_t)fixed_divide(table_q38, current_q9));
+    phase->tail_charge += fixed_product(charge, charge);
+}
+
 COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scale_sample_t *sample, int32_t least_q9) {
     table_scale_phase_t *phase = &scale->phase[index];
     if (sample->zero) {
         if (phase->whole) {
             end(scale, phase, least_q9);
         }
-        *phase = (table_scale_phase_t){.whole = true};
+        *phase = (table_scale_phase_t){.whole = true, .rest_q17 = rest_q17(phase, sample->current_q9)};
         return;
     }
     phase->whole = phase->whole && !sample->lost && phase->charge_q10 < CHARGE_MAX_Q10;
@@ -146,6 +168,7 @@ COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scal
     phase->ended = phase->ended || (sample->none && phase->current_q9 > sample->current_q9);
     if (!phase->ended) {
         integrate(phase, sample);
+        close(phase, sample);
     }
     phase->corrections_q29 = fixed_add(phase->corrections_q29, sample->correction_q29);
 }

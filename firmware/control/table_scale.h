@@ -39,16 +39,18 @@
 
 /* Of a phase; all zero at the start. */
 typedef struct {
-    bool ended;                     /* the current has fallen so far that the integral of the voltage is limited to 0 */
-    bool whole;                     /* sampled since its current was zero */
-    int32_t corrections_q29;        /* of the integral of the voltage, Wb, Q2.29 */
-    int32_t drops_q29;              /* integral of the devices' drops, Wb, Q2.29 */
-    int32_t current_q9;             /* at the last sample, A, Q7.9 */
-    int32_t flux_q29, table_q29;    /* at the last sample, Wb, Q2.29 */
-    int32_t most_q9, most_q29;      /* largest current, and flux linkage by the tables */
-    int64_t applied_q39, table_q39; /* integrals of i dpsi by voltage and tables, J */
-    int64_t charge_q10;             /* of i, A periods */
-    int64_t square_q18;             /* of i^2, A^2 periods */
+    bool ended;       /* the current has fallen so far that the integral of the voltage is limited to 0 */
+    bool whole;       /* sampled since its current was zero */
+    int32_t rest_q17; /* what the sensor reads without a current, A, Q7.17 */
+    int64_t tail, tail_table, tail_charge; /* sums of (1), as of table_scale_t */
+    int32_t corrections_q29;               /* of the integral of the voltage, Wb, Q2.29 */
+    int32_t drops_q29;                     /* integral of the devices' drops, Wb, Q2.29 */
+    int32_t current_q9;                    /* at the last sample, A, Q7.9 */
+    int32_t flux_q29, table_q29;           /* at the last sample, Wb, Q2.29 */
+    int32_t most_q9, most_q29;             /* largest current, and flux linkage by the tables */
+    int64_t applied_q39, table_q39;        /* integrals of i dpsi by voltage and tables, J */
+    int64_t charge_q10;                    /* of i, A periods */
+    int64_t square_q18;                    /* of i^2, A^2 periods */
 } table_scale_phase_t;
 
 /* All zero but for `scale_q30` and `smooth_q30`, 1, at the start. */
