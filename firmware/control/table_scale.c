@@ -18,7 +18,7 @@
 
 /* Least work of an interval, part of its largest current times its largest flux linkage: of less, as of a phase that
  * drives and brakes in turn, the ratio says little. */
-#define WORK_SHIFT 3
+#define WORK_SHIFT 4
 
 /* Largest flux linkage of a sample for (1), part of the largest one: with more it is hardly another equation than (2).
  */

@@ -31,11 +31,17 @@ ditc_hysteresis_limit_t torque_control_limit(const control_parameters_t *paramet
                                  turns_backwards(speed_q22) ? fixed_subtract(0, speed_q22) : 0);
 }
 
+/* Torque by which the estimate is below the reference, in units of the tables, in which bands and gains of DITC suit
+ * the currents. */
+static int32_t torque_error_q24(const control_state_t *state, const control_measurement_t *measured) {
+    return table_scale_multiply(fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
+                                state->table_scale.inverse_excess_q31);
+}
+
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
                                const deferred_results_t *deferred, const control_measurement_t *measured) {
-    const int32_t error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24);
-    ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, error_q24, measured->current_q9,
-                         deferred->limit, state->duty_q15);
+    ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, torque_error_q24(state, measured),
+                         measured->current_q9, deferred->limit, state->duty_q15);
 }
 
 /* False when hysteresis control is to act instead. */
@@ -56,8 +62,8 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
         .torque = measured->torque,
-        .reference_q24 = state->torque_reference_q24,
-        .error_q24 = fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
+        .reference_q24 = table_scale_multiply(state->torque_reference_q24, state->table_scale.inverse_excess_q31),
+        .error_q24 = torque_error_q24(state, measured),
     };
     pwm_ditc_step(&parameters->duty, &state->duty, &measured->commutation, &sample, state->duty_q15);
     return true;
