@@ -142,14 +142,17 @@ static int32_t rest_q17(const table_scale_phase_t *phase, int32_t current_q9) {
  * sensor reads without a current can be taken away from both. */
 static void close(table_scale_phase_t *phase, const table_scale_sample_t *sample) {
     const int32_t current_q9 = sample->current_q9, rest_q9 = phase->rest_q17 >> REST_BITS;
-    if (current_q9 <= rest_q9 || phase->table_q29 >= phase->most_q29 >> END_SHIFT) {
+    const int32_t limit_q29 = phase->most_q29 >> END_SHIFT;
+    if (current_q9 <= rest_q9 || phase->table_q29 >= limit_q29) {
         return;
     }
     const int32_t charge = (int32_t)(phase->charge_q10 >> CHARGE_COARSER);
+    const int32_t weight_q8 = (limit_q29 - phase->table_q29) / ((limit_q29 >> 8) + 1);
+    const int32_t weighted = (int32_t)((int64_t)charge * weight_q8 >> 8);
     const int64_t table_q38 = fixed_product(phase->table_q29 >> FLUX_COARSER, current_q9 - rest_q9);
-    phase->tail += fixed_product(charge, phase->flux_q29 >> FLUX_COARSER);
-    phase->tail_table += fixed_product(charge, (int32_t)fixed_divide(table_q38, current_q9));
-    phase->tail_charge += fixed_product(charge, charge);
+    phase->tail += fixed_product(weighted, phase->flux_q29 >> FLUX_COARSER);
+    phase->tail_table += fixed_product(weighted, (int32_t)fixed_divide(table_q38, current_q9));
+    phase->tail_charge += fixed_product(weighted, charge);
 }
 
 COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scale_sample_t *sample, int32_t least_q9) {
