@@ -58,6 +58,7 @@ typedef struct {
     table_scale_phase_t phase[HAL_PHASES_MAX];
     int64_t applied_q30, table_q30, square_q10; /* sums of (2) */
     int64_t end, end_table, charge;             /* sums of (1), weighted: Wb A periods, Q21 Q1; A^2 periods^2, Q1 Q1 */
+    bool differs;                               /* s is another one than 1: from 1/100 on, until it is within 1/200 */
     uint32_t intervals;                         /* since the start, at most TABLE_SCALE_INTERVALS_MIN */
     int32_t scale_q30;                          /* s of the sums, Q1.30 */
     int32_t smooth_q30;                         /* that follows it, Q1.30 */
@@ -109,7 +110,8 @@ static inline int32_t table_scale_part_q31(uint32_t control_rate_hz) {
     return (int32_t)((UINT32_C(1) << 31) / (control_rate_hz / 5u));
 }
 
-/* Moves smooth_q30 towards scale_q30 times a factor, Q1.30, by a part of the difference, Q0.31. [background] */
+/* Moves smooth_q30 towards scale_q30, or 1 when it does not differ, times a factor, Q1.30, by a part of the difference,
+ * Q0.31: tables that are right stay as they are, and nothing moves with the errors of the scale. [background] */
 void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t part_q31);
 
 #endif

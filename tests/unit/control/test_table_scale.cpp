@@ -180,6 +180,22 @@ TEST_F(TableScale, is_used_from_the_fourth_interval_on_and_followed_slowly) {
     EXPECT_NEAR(state.smooth_q30 / Q30, 1.2, 0.003);
 }
 
+TEST_F(TableScale, leaves_tables_that_are_right_as_they_are) {
+    const int32_t all_q31 = INT32_MAX;
+    const auto in_effect = [&](double gain) {
+        flux_gain = gain;
+        intervals(100);
+        table_scale_follow(&state, TABLE_SCALE_ONE_Q30, all_q31);
+        return state.smooth_q30 / Q30;
+    };
+    EXPECT_EQ(in_effect(1.008), 1.0);
+    EXPECT_NEAR(in_effect(1.012), 1.012, 0.002);
+    EXPECT_NEAR(in_effect(1.008), 1.008, 0.002); // once it has been another one
+    EXPECT_NEAR(in_effect(1.002), 1.0, 1e-6);
+    EXPECT_EQ(in_effect(0.992), 1.0);
+    EXPECT_NEAR(in_effect(0.985), 0.985, 0.002);
+}
+
 TEST_F(TableScale, is_limited) {
     flux_gain = 2.0;
     intervals(5);
