@@ -218,7 +218,7 @@ static void follow_table_scale(drive_t *drive, const sample_t *sampled, const in
     flux_observer_parameters_t flux = parameters->predictive.flux;
     const int32_t nominal_q40 = flux.resistance_period_q40;
     if (follows) { /* from half of it to twice: copper from -70 to 280 C */
-        flux.resistance_period_q40 = fixed_clamp(fixed_add(nominal_q40, drive->table_scale.resistance_q40),
+        flux.resistance_period_q40 = fixed_clamp(fixed_add(nominal_q40, drive->table_scale.smooth_resistance_q40),
                                                  nominal_q40 / 2, fixed_add(nominal_q40, nominal_q40));
     }
     const table_scale_factors_t factors =

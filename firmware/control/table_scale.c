@@ -78,7 +78,7 @@ static void solve(table_scale_t *scale) {
     const int32_t found_q30 = fixed_saturate(fixed_divide(applied << 30, table));
     scale->scale_q30 = fixed_clamp(found_q30, TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
     const int32_t difference_q30 = fixed_abs(scale->scale_q30 - TABLE_SCALE_ONE_Q30);
-    scale->differs = difference_q30 > (scale->differs ? TABLE_SCALE_ONE_Q30 / 200 : TABLE_SCALE_ONE_Q30 / 100);
+    scale->differs = difference_q30 > (scale->differs ? TABLE_SCALE_ONE_Q30 / 80 : TABLE_SCALE_ONE_Q30 / 40);
     scale->resistance_q40 = fixed_subtract(by_voltage_q40, multiply_q30(by_table_q40, scale->scale_q30));
 }
 
@@ -179,8 +179,11 @@ COLD void table_scale_add(table_scale_t *scale, unsigned index, const table_scal
 }
 
 COLD void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t part_q31) {
-    const int32_t found_q30 = scale->differs ? scale->scale_q30 : TABLE_SCALE_ONE_Q30;
+    const bool differs = scale->differs || factor_q30 != TABLE_SCALE_ONE_Q30;
+    const int32_t found_q30 = differs ? scale->scale_q30 : TABLE_SCALE_ONE_Q30;
     const int32_t target_q30 =
         fixed_clamp(multiply_q30(found_q30, factor_q30), TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
     scale->smooth_q30 += fixed_multiply(fixed_subtract(target_q30, scale->smooth_q30), part_q31, 31);
+    scale->smooth_resistance_q40 +=
+        fixed_multiply(fixed_subtract(scale->resistance_q40, scale->smooth_resistance_q40), part_q31, 31);
 }
