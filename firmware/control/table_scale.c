@@ -185,5 +185,5 @@ COLD void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t p
         fixed_clamp(multiply_q30(found_q30, factor_q30), TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
     scale->smooth_q30 += fixed_multiply(fixed_subtract(target_q30, scale->smooth_q30), part_q31, 31);
     scale->smooth_resistance_q40 +=
-        fixed_multiply(fixed_subtract(scale->resistance_q40, scale->smooth_resistance_q40), part_q31, 31);
+        fixed_multiply(fixed_subtract(scale->resistance_q40, scale->smooth_resistance_q40), part_q31 / 4, 31);
 }

@@ -111,9 +111,9 @@ static inline int32_t table_scale_part_q31(uint32_t control_rate_hz) {
     return (int32_t)((UINT32_C(1) << 31) / (control_rate_hz / 5u));
 }
 
-/* Moves smooth_q30 and the resistance towards what was found, the scale to scale_q30, or 1 when it does not differ,
- * times a factor, Q1.30, by a part of the difference, Q0.31: tables that are right stay as they are, and nothing moves
- * with the errors of the scale. [background] */
+/* Moves smooth_q30 towards scale_q30 times a factor, Q1.30, by a part of the difference, Q0.31, and the resistance by a
+ * quarter of the part. While the scale does not differ and the factor is 1, towards 1: tables that are right stay as
+ * they are, and nothing moves with the errors of the scale. [background] */
 void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t part_q31);
 
 #endif

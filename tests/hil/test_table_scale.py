@@ -95,7 +95,7 @@ def test_warm_winding_leaves_no_ripple_once_the_resistance_is_known(make_bench):
     found = {}
     for table_scale in (0, 2):
         bench = held(make_bench, "saturating", 300, resistance=1.5, table_scale=table_scale)
-        torque_after(bench, 16, 0.9)
+        torque_after(bench, 16, 2.5)
         found[table_scale] = ripple(bench)
     assert 0.0025 < found[0] < 0.004
     assert 0.0008 < found[2] < 0.002
@@ -103,11 +103,13 @@ def test_warm_winding_leaves_no_ripple_once_the_resistance_is_known(make_bench):
 
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 @pytest.mark.parametrize("flux", [0.8, 1.2])
-def test_other_controllers_have_the_torque_that_they_have_with_right_tables(make_bench, controller, flux):
-    right = held(make_bench, "saturating", 300, controller=controller)
+def test_other_controllers_know_the_torque_that_they_make(make_bench, controller, flux):
+    """Its mean differs from the reference by their laws, with hysteresis by 4 %; without the scale both by 20 %."""
     bench = held(make_bench, "saturating", 300, flux, controller=controller)
-    expected_Nm = torque_after(right, 8, 0.5)
-    assert torque_after(bench, 8, 2.0) == pytest.approx(expected_Nm, rel=0.03)
+    mean_Nm = torque_after(bench, 8, 2.0)
+    estimate_Nm = bench.telemetry["DRIVE_TORQUE.torque_estimate_Nm"].between(bench.time_s - 0.2, bench.time_s).value
+    assert mean_Nm == pytest.approx(8, rel=0.06)
+    assert estimate_Nm.mean() == pytest.approx(mean_Nm, rel=0.03)
     assert bench.drive.state == "run"
 
 

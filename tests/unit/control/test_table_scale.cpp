@@ -188,12 +188,12 @@ TEST_F(TableScale, leaves_tables_that_are_right_as_they_are) {
         table_scale_follow(&state, TABLE_SCALE_ONE_Q30, all_q31);
         return state.smooth_q30 / Q30;
     };
-    EXPECT_EQ(in_effect(1.008), 1.0);
-    EXPECT_NEAR(in_effect(1.012), 1.012, 0.002);
-    EXPECT_NEAR(in_effect(1.008), 1.008, 0.002); // once it has been another one
-    EXPECT_NEAR(in_effect(1.002), 1.0, 1e-6);
-    EXPECT_EQ(in_effect(0.992), 1.0);
-    EXPECT_NEAR(in_effect(0.985), 0.985, 0.002);
+    EXPECT_EQ(in_effect(1.02), 1.0);
+    EXPECT_NEAR(in_effect(1.03), 1.03, 0.002);
+    EXPECT_NEAR(in_effect(1.02), 1.02, 0.002); // once it has been another one
+    EXPECT_NEAR(in_effect(1.008), 1.0, 1e-6);
+    EXPECT_EQ(in_effect(0.98), 1.0);
+    EXPECT_NEAR(in_effect(0.965), 0.965, 0.002);
 }
 
 TEST_F(TableScale, is_limited) {
