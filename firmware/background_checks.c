@@ -176,7 +176,7 @@ static int32_t factor_by_shaft_q30(drive_t *drive) {
         .torque_variance_q14 = inertia->torque_variance_q14,
         .acceleration_variance_q14 = inertia->acceleration_variance_q14,
         .covariance_q14 = inertia->covariance_q14,
-        .counts = (deferred->mode == DRIVE_MODE_TORQUE || inertia->transient_windows > 0) && inertia->shift == 0 &&
+        .counts = deferred->mode == DRIVE_MODE_TORQUE && inertia->shift == 0 &&
                   drive->table_scale.intervals >= TABLE_SCALE_INTERVALS_MIN,
         .in_effect_q30 = drive->table_scale.smooth_q30,
         .scale_q30 = drive->table_scale.scale_q30,

@@ -10,8 +10,8 @@
 
 /* Sums of windows whose variance is the least that counts, from which on the factor is used, and of which the older
  * half is forgotten. */
-#define WINDOWS_MIN 4
-#define WINDOWS_MAX 256
+#define WINDOWS_MIN 64
+#define WINDOWS_MAX 1024
 
 static int32_t factor_q30(const shaft_torque_t *shaft, int32_t scale_q30) {
     unsigned shift = 0;

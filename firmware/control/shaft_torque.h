@@ -1,5 +1,5 @@
 /* Torque of a free shaft by its acceleration: the factor by which the torque differs from that of the tables, from
- * changes of the torque that follow no load.
+ * changes of the torque in torque mode, which follow no load.
  *
  * inertia.h has the variance of the torque T and its covariance with A = J0 dw/dt, both less their means over some
  * milliseconds, so that a load that stays the same does not count. In units of the tables, T / s with the scale s in

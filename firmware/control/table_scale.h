@@ -66,8 +66,9 @@ typedef struct {
     int32_t smooth_resistance_q40;              /* that follows it */
 } table_scale_t;
 
-/* Intervals from which on a scale is used. */
-#define TABLE_SCALE_INTERVALS_MIN 4u
+/* Intervals from which on a scale is used: the first ones of a start are at few angles, at which an error of the
+ * encoder is one of the torque. */
+#define TABLE_SCALE_INTERVALS_MIN 12u
 
 typedef struct {
     int32_t current_q9;     /* A, Q7.9 */

@@ -47,7 +47,7 @@ TEST_F(ShaftTorque, is_the_missing_factor_less_its_tolerance) {
             for (const double in_effect : {0.9, 1.0, 1.2}) {
                 state = {};
                 sample.scale_q30 = to_fixed(scale * gain, Q30); // by the energy
-                windows(20, scale, in_effect);
+                windows(100, scale, in_effect);
                 const double missing = 1.0 / gain - 1.0, tolerance = 1.0 / 80.0;
                 const double expected =
                     std::fabs(missing) < tolerance ? 0.0 : missing - std::copysign(tolerance, missing);
@@ -60,13 +60,13 @@ TEST_F(ShaftTorque, is_the_missing_factor_less_its_tolerance) {
 TEST_F(ShaftTorque, is_1_for_another_inertia) {
     for (const double ratio : {0.5, 0.9, 1.1, 2.0}) {
         state = {};
-        windows(20, ratio, 1.0);
+        windows(100, ratio, 1.0);
         EXPECT_EQ(state.factor_q30, 1 << 30) << ratio;
     }
 }
 
 TEST_F(ShaftTorque, is_1_without_strong_changes_that_the_acceleration_follows) {
-    windows(3, 1.05, 1.0, 5.5); // too few
+    windows(40, 1.05, 1.0, 5.5); // too few
     EXPECT_EQ(state.factor_q30, 1 << 30);
     state = {};
     windows(100, 1.05, 1.0, 2.0); // too small
@@ -77,7 +77,7 @@ TEST_F(ShaftTorque, is_1_without_strong_changes_that_the_acceleration_follows) {
     windows(100, 1.05, 1.0);
     EXPECT_EQ(state.factor_q30, 1 << 30);
     sample.counts = true;
-    windows(20, 1.05, 1.0);
+    windows(100, 1.05, 1.0);
     EXPECT_NEAR(factor(), 1.05 - 1.0 / 80.0, 2e-4);
 }
 

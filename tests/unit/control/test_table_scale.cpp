@@ -122,7 +122,7 @@ TEST_F(TableScale, is_that_of_the_machine_whatever_resistance_drops_speed_and_di
                     flux_gain = factor;
                     resistance_gain = ohm;
                     drop_V = ohm > 1.0 ? 1.7 : 0.0;
-                    intervals(6);
+                    intervals(14);
                     EXPECT_NEAR(scale(), factor, 0.003 * factor) << rpm << " r/min, brakes " << brakes << ", R " << ohm;
                     EXPECT_NEAR(resistance_ohm(), ohm * RESISTANCE_OHM, 0.01 * RESISTANCE_OHM * (1.0 + rpm / 150.0))
                         << rpm << " r/min, brakes " << brakes << ", flux " << factor;
@@ -139,7 +139,7 @@ TEST_F(TableScale, is_that_of_the_machine_whatever_resistance_drops_speed_and_di
 // torque is wrong by the gain alone.
 TEST_F(TableScale, cannot_tell_the_gain_of_the_current_but_leaves_only_the_gain_itself_as_an_error) {
     gain = 1.05;
-    intervals(6);
+    intervals(14);
     double true_J = 0.0, table_J = 0.0, last_A = 0.0, last_Wb = 0.0, last_table_Wb = 0.0;
     for (double rev = on; rev < off; rev += 1e-4) {
         const double rise = std::min((rev - on) / 0.02, 1.0), fall = std::clamp((off - rev) / 0.05, 0.0, 1.0);
@@ -156,15 +156,15 @@ TEST_F(TableScale, cannot_tell_the_gain_of_the_current_but_leaves_only_the_gain_
 
 TEST_F(TableScale, at_a_wrong_angle_is_the_factor_of_the_work) {
     misaligned = 0.015; // 5.4 electrical degrees
-    intervals(6);
+    intervals(14);
     EXPECT_NEAR(scale(), twin.scale, 2e-3);
     EXPECT_GT(std::fabs(scale() - 1.0), 0.005);
     EXPECT_NEAR(scale(), 1.0, 0.1);
 }
 
-TEST_F(TableScale, is_used_from_the_fourth_interval_on_and_followed_slowly) {
+TEST_F(TableScale, is_used_from_the_twelfth_interval_on_and_followed_slowly) {
     flux_gain = 1.2;
-    intervals(3);
+    intervals(11);
     EXPECT_EQ(state.scale_q30, TABLE_SCALE_ONE_Q30);
     interval();
     EXPECT_NEAR(scale(), 1.2, 0.004);
@@ -198,7 +198,7 @@ TEST_F(TableScale, leaves_tables_that_are_right_as_they_are) {
 
 TEST_F(TableScale, is_limited) {
     flux_gain = 2.0;
-    intervals(5);
+    intervals(14);
     EXPECT_EQ(state.scale_q30, TABLE_SCALE_MAX_Q30);
     flux_gain = 0.3;
     intervals(100);
@@ -221,7 +221,7 @@ TEST_F(TableScale, is_not_learned_from_small_currents_lost_periods_or_hardly_any
     EXPECT_EQ(state.scale_q30, TABLE_SCALE_ONE_Q30);
     on = 0.52;
     off = 0.95;
-    intervals(5);
+    intervals(14);
     EXPECT_NEAR(scale(), 1.2, 0.004);
 }
 
