@@ -188,9 +188,36 @@ static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
     return from + 4 * (uint32_t)fixed_multiply_high((int32_t)(to - from), level_q15 << 15);
 }
 
+/* Angle between two torques and two speeds of the tables, in 2^-24 electrical rev. */
+static int32_t between_windows(int32_t still, int32_t still_above, int32_t base, int32_t base_above, int32_t part_q8,
+                               int32_t speed_q8) {
+    const int32_t at_rest = between_q8(still, still_above, part_q8);
+    return at_rest + (((between_q8(base, base_above, part_q8) - at_rest) * speed_q8) >> 8);
+}
+
+/* Windows with the least current for the torque. */
+static conduction_sharing_t sharing_for_torque(const machine_tables_t *tables, const conduction_state_t *state) {
+    const int32_t index_q8 = (int32_t)(state->place.k << 8) + state->place.fraction_q8;
+    const int32_t base_q8 = tables->pulse_base_index;
+    const int32_t speed_q8 = index_q8 < base_q8 ? index_q8 * ONE_Q8 / base_q8 : ONE_Q8;
+    const int32_t quarters_q8 = (state->torque_q24 >> 16) * (MACHINE_SHARING_PARTS * ONE_Q8) / tables->sharing_torque;
+    const int32_t place_q8 = fixed_clamp(quarters_q8 - ONE_Q8, 0, (MACHINE_SHARING_PARTS - 1) * ONE_Q8);
+    const int32_t k = place_q8 < (MACHINE_SHARING_PARTS - 1) * ONE_Q8 ? place_q8 >> 8 : MACHINE_SHARING_PARTS - 2;
+    const int32_t part_q8 = place_q8 - k * ONE_Q8;
+    const machine_sharing_window_t *still = &tables->sharing[state->braking][0][k];
+    const machine_sharing_window_t *base = &tables->sharing[state->braking][1][k];
+    return (conduction_sharing_t){
+        .on = (uint32_t)between_windows(still[0].on, still[1].on, base[0].on, base[1].on, part_q8, speed_q8) << 8,
+        .off = (uint32_t)between_windows(still[0].off, still[1].off, base[0].off, base[1].off, part_q8, speed_q8) << 8,
+    };
+}
+
 static conduction_interval_t sharing_interval(const conduction_parameters_t *parameters,
                                               const conduction_state_t *state) {
     const torque_sharing_parameters_t *sharing = &parameters->sharing;
+    if (parameters->own_windows) {
+        return (conduction_interval_t){.enter = state->sharing.on, .leave = state->sharing.off};
+    }
     if (state->braking) {
         return (conduction_interval_t){.enter = -sharing->turn_off, .leave = -sharing->turn_on};
     }
@@ -396,6 +423,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         if (state->partial_q15 > 0) {
             state->part = pulse_for_torque(tables, state);
         }
+        state->sharing = sharing_for_torque(tables, state);
         break;
     case 3:
         limit_torque(parameters, state, sample);

@@ -1,9 +1,18 @@
-/* Conduction angles of the phases: torque sharing, its windows advanced at the voltage limit, and single pulse
- * operation.
+/* Conduction angles of the phases: torque sharing and single pulse operation.
  *
- * Window advance: a torque shortfall moves the conduction windows to earlier angles (torque_sharing.h), fully within
- * 100 ms; without shortfall they return within 1 s, above base speed within 8 s. From base speed on they begin at the
- * angles of the tables for parts of the largest torque.
+ * Windows of torque sharing are those of the machine with the least copper loss, from tables over the torque and the
+ * speed / voltage (tools/src/salient/machine/sharing_window.py), up to the base speed
+ *
+ *   on, off = (1 - w) still(T) + w base(T),   w = speed / voltage over that of the base speed, at most 1
+ *
+ * with straight lines over the torque T between quarters of the largest one that a window makes at every angle. The
+ * angle in which a voltage builds up a flux linkage is proportional to speed / voltage: that is how far they begin and
+ * end earlier. A current limit or an angle without torque moves none.
+ *
+ * Window advance, of constant windows that parameters set: a torque shortfall moves them to earlier angles
+ * (torque_sharing.h), fully within 100 ms; without shortfall they return within 1 s, above base speed within 8 s. The
+ * state is the same with windows from the tables, which it does not move: a shortfall that lasts. From base speed on
+ * windows begin at the angles of the tables for parts of the largest torque.
  *
  * Single pulse: above base speed the voltage has no time to build up the flux linkage of the torque after the unaligned
  * position. Turn-on then leads the half in which the phase makes the wanted torque, and turn-off is early enough that
@@ -16,8 +25,8 @@
  * with angles past the begin of that half, and T the mean of the reference over about a stroke. T_smooth is the largest
  * torque without lead and without ripple, T_mean the largest mean torque. The trim is the integral over the angle of
  * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque that of
- * the reference. It begins where the voltage limits the windows of torque sharing, above base speed as soon as it does:
- * the way by their advance is longer and leaves up to 5 % of the torque missing. With single pulses the torque
+ * the reference. It begins where a shortfall has lasted, above base speed at once: the way by the advance is longer and
+ * leaves up to 5 % of the torque missing. With single pulses the torque
  * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
  *
  * From base speed on, fully at 1.125 of it, the angles are instead those for the part of the largest mean torque,
@@ -87,6 +96,7 @@ typedef struct {
 typedef struct {
     torque_sharing_parameters_t sharing;
     conduction_t initial;   /* torque sharing without advance */
+    bool own_windows;       /* of the machine, from its tables; false: constant, and advanced */
     bool single_pulse;      /* false: torque sharing only */
     uint8_t longer_pulses;  /* 3: where the DC link limits the braking torque, from base speed on; 0: never */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
@@ -127,6 +137,11 @@ typedef struct {
     int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24 */
 } conduction_part_t;
 
+/* Window of torque sharing, past the begin of the half, 2^-32 electrical rev. */
+typedef struct {
+    uint32_t on, off;
+} conduction_sharing_t;
+
 #define CONDUCTION_STEPS 5   /* of an update */
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
@@ -152,6 +167,7 @@ typedef struct {
     int32_t part_q15;        /* of the largest mean torque, Q1.15, 0..1 */
     bool single_pulse;       /* the torque pulsates, or a phase turns on before its half */
     uint16_t way_q15;        /* from a braking pulse to one without a torque, Q1.15, 0..1 */
+    conduction_sharing_t sharing; /* from the tables */
     conduction_part_t part;
     conduction_interval_t interval; /* of the half with the torque */
     int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */

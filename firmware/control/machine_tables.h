@@ -82,6 +82,16 @@ typedef struct {
     uint8_t ripple;
 } machine_partial_pulse_t;
 
+/* Windows of torque sharing up to the base speed (tools/src/salient/machine/sharing_window.py): at standstill and at the
+ * base speed, for 1/4, 1/2, 3/4 and all of the largest torque that they make at every angle. */
+#define MACHINE_SHARING_SPEEDS 2
+#define MACHINE_SHARING_PARTS 4
+
+typedef struct {
+    int16_t on;  /* turn-on past the begin of the half of the wanted torque, 2^-16 electrical rev; negative: before */
+    int16_t off; /* turn-off past it, 2^-16 electrical rev; neighbours in the tables differ by less than a quarter */
+} machine_sharing_window_t;
+
 #define MACHINE_PARAMETERS_MAX 64
 
 typedef struct {
@@ -112,6 +122,8 @@ typedef struct {
     machine_pulse_t pulse[2][MACHINE_PULSE_POINTS]; /* motoring, braking */
     machine_partial_pulse_t partial_pulse[2][MACHINE_PULSE_PARTS][MACHINE_PULSE_POINTS];
     uint16_t pulse_base_index; /* of the base speed at the nominal voltage, Q8 */
+    machine_sharing_window_t sharing[2][MACHINE_SHARING_SPEEDS][MACHINE_SHARING_PARTS]; /* motoring, braking */
+    uint16_t sharing_torque; /* largest torque of those windows at standstill, N m, Q7.8, >= 1 */
     /* A braking current stays within its limit under full opposite voltage up to the angle theta_t at which it is
      * psi_t, when psi <= psi_t + V / omega (theta_t - theta); past theta_t, when it is within its limit. Where no angle
      * needs that, theta_t is where psi at the limit falls fastest. */

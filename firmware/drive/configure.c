@@ -243,8 +243,27 @@ static torque_trim_parameters_t trim_from(const int32_t *values) {
     };
 }
 
-static torque_sharing_parameters_t sharing_from(const int32_t *values, unsigned phases) {
-    const uint32_t stroke = commutation_stroke(phases);
+/* Windows of the machine from its tables. */
+static bool own_windows(const int32_t *values) {
+    return values[PARAMETER_SHARE_ON_ANGLE_DEG] < 180 << 7;
+}
+
+/* Widest window of the tables, of the largest torque. */
+static torque_sharing_parameters_t own_sharing_from(const int32_t *values, const machine_tables_t *tables) {
+    const machine_sharing_window_t *window = &tables->sharing[CONDUCTION_MOTORING][0][MACHINE_SHARING_PARTS - 1];
+    return (torque_sharing_parameters_t){
+        .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
+        .stroke = commutation_stroke(tables->phases),
+        .turn_on = HALF_REV + ((uint32_t)window->on << 16),
+        .turn_off = HALF_REV + ((uint32_t)window->off << 16),
+    };
+}
+
+static torque_sharing_parameters_t sharing_from(const int32_t *values, const machine_tables_t *tables) {
+    const uint32_t stroke = commutation_stroke(tables->phases);
+    if (own_windows(values)) {
+        return own_sharing_from(values, tables);
+    }
     const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
     const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
     const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
@@ -271,7 +290,7 @@ static int32_t fold_back_range_q6(int32_t over_voltage_q6, int32_t range_q6) {
 static conduction_parameters_t conduction_from(const int32_t *values, const machine_tables_t *tables,
                                                uint32_t control_rate_hz, int32_t torque_min_q24) {
     const unsigned phases = tables->phases;
-    const torque_sharing_parameters_t sharing = sharing_from(values, phases);
+    const torque_sharing_parameters_t sharing = sharing_from(values, tables);
     const torque_sharing_window_t base_window = torque_sharing_window(&sharing, 0);
     const int32_t over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V];
     const int32_t range_q6 = fold_back_range_q6(over_voltage_q6, tables->fold_back_q6);
@@ -285,6 +304,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
     return (conduction_parameters_t){
         .sharing = sharing,
         .initial = conduction_initial(&base_window),
+        .own_windows = own_windows(values),
         /* A reserve loads both halves against each other: turn-on of one leads into the other. */
         .single_pulse = sharing.overlapping && values[PARAMETER_TORQUE_RESERVE_NM] == 0,
         /* Not where the limit of each period reduces the torque at the voltage that their feedback holds. */

@@ -36,6 +36,9 @@ from salient.machine.magnetics import FORMULA_KEYS
 from salient.machine.partial_pulse import PARTS
 from salient.machine.pulse_tables import PulseTables, pulse_tables
 from salient.machine.scaling import Scaling, database_of, scaling_of
+from salient.machine.sharing_tables import SharingTables, sharing_tables
+from salient.machine.sharing_window import PARTS as SHARING_PARTS
+from salient.machine.sharing_window import SPEEDS, sharing_window
 from salient.machine.single_pulse import POINTS
 
 MAGIC = b"SALIENTM"
@@ -49,6 +52,7 @@ _TYPES: dict[str, Any] = {
     "machine_row_t": [("start", "<u4"), ("reciprocal", "<i4")],
     "machine_pulse_t": [(name, "<u2") for name in ("lead", "end", "smooth_torque", "mean_torque", "peak_torque")],
     "machine_partial_pulse_t": [("on", "<i1"), ("end", "<u1"), ("ripple", "<u1")],
+    "machine_sharing_window_t": [("on", "<i2"), ("off", "<i2")],
 }  # fmt: skip
 
 
@@ -118,11 +122,14 @@ class FirmwareTables:
 
     phase_map: PhaseMap
     pulse: PulseTables
+    sharing: SharingTables
 
 
 def firmware_tables(path: Path | str, machine: Machine, scaling: Scaling) -> FirmwareTables:
     """The tables of a machine file's machine; MachineError when the formats cannot hold them."""
-    return FirmwareTables(machine_phase_map(path, machine, scaling.exponents), pulse_tables(machine, scaling))
+    window = sharing_window(machine, scaling.data)
+    return FirmwareTables(machine_phase_map(path, machine, scaling.exponents), pulse_tables(machine, scaling, window),
+                          sharing_tables(window, scaling.exponents))
 
 
 def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
@@ -188,6 +195,9 @@ TABLES = Structure("machine_tables_t", (
     Member("partial_pulse", "machine_partial_pulse_t", lambda machine, scaling, tables: tables.pulse.partial_pulses(),
            (2, len(PARTS), POINTS)),
     Member("pulse_base_index", "uint16_t", lambda machine, scaling, tables: tables.pulse.base_index),
+    Member("sharing", "machine_sharing_window_t", lambda machine, scaling, tables: tables.sharing.windows(),
+           (2, SPEEDS, len(SHARING_PARTS))),
+    Member("sharing_torque", "uint16_t", lambda machine, scaling, tables: tables.sharing.torque),
     Member("braking_end", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_end, (POINTS,)),
     Member("braking_flux", "uint16_t", lambda machine, scaling, tables: tables.pulse.braking_flux, (POINTS,)),
     Member("parameter_default", "int32_t", lambda machine, scaling, tables: _padded(scaling.raw_parameters()),

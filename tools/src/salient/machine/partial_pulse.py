@@ -19,6 +19,7 @@ import numpy as np
 
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
+from salient.machine.sharing_window import SharingWindow
 from salient.machine.single_pulse import LANE_DEG, STEP_DEG, TURN, Pairs, Phase, SinglePulse, parabola, vertex
 
 PARTS = (0.25, 0.5, 0.75)
@@ -103,13 +104,12 @@ class _Operation:
     """Of each phase, to go on with."""
 
 
-def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> PartialPulse:
+def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse, window: SharingWindow) -> PartialPulse:
     """From the last of its speeds below the base speed on; before it the same."""
     first = max(int(np.searchsorted(of.speed_per_voltage, of.base_speed_per_voltage)) - 1, 1)
     speed_rad_s = of.speed_per_voltage[first:] * machine.supply_voltage_V
     mean_Nm = of.mean_Nm[:, first:]
     phase = Phase(machine, data.parameters["current_limit_A"])
-    window_deg = np.array(of.sharing_deg) - 180.0
     found = []
     for half, pairs in enumerate(phase.pairs(speed_rad_s)):
         part = np.repeat(PARTS, len(speed_rad_s))
@@ -120,7 +120,7 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse) -> Partial
         largest_deg = np.array([-of.lead_deg[half, first:], of.end_deg[half, first:]])
         follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(PARTS)))
         choices = follower.operations(wanted_Nm, pulse_deg, np.tile(largest_deg, len(PARTS)),
-                                      window_deg if half == 0 else 180.0 - window_deg[::-1])
+                                      window.at_base_speed_deg(half == 1, wanted_Nm))
         angles_deg, reference_Nm = _chosen(choices, largest_deg)
         ripple = (reference_Nm.ravel() / wanted_Nm - 1.0) * part
         ripple = np.where(ripple > -_LOWERED_LEAST, np.maximum(ripple, 0.0), ripple)
@@ -224,7 +224,7 @@ class _Follower:
         # Of a slightly different torque.
         least_A = pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
         earlier_deg, to_largest, to_pulse = _WAYS[self.half].T[..., None]
-        angles_deg = sharing_deg[:, None, None] - earlier_deg
+        angles_deg = sharing_deg[:, None] - earlier_deg
         angles_deg = angles_deg + to_largest * (largest_deg[:, None] - angles_deg)
         angles_deg = angles_deg + to_pulse * (pulse_deg[:, None] - angles_deg)
         reference_Nm = wanted_Nm * (1.0 + to_pulse * (crest - 1.0))

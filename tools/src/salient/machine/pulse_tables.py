@@ -12,6 +12,7 @@ import numpy as np
 from salient.machine.definition import Machine
 from salient.machine.partial_pulse import PartialPulse, partial_pulse
 from salient.machine.scaling import Exponents, Scaling
+from salient.machine.sharing_window import SharingWindow
 from salient.machine.single_pulse import SinglePulse, single_pulse
 
 _UINT16_MAX, _HALF_TURN = (1 << 16) - 1, 1 << 15
@@ -45,12 +46,12 @@ class PulseTables:
         return [[[tuple(row) for row in part] for part in half] for half in self.partial.tolist()]
 
 
-def pulse_tables(machine: Machine, scaling: Scaling) -> PulseTables:
-    """The tables of a machine."""
+def pulse_tables(machine: Machine, scaling: Scaling, window: SharingWindow) -> PulseTables:
+    """The tables of a machine with its windows of torque sharing."""
     exponents = scaling.exponents
     least = math.ldexp(1.0, _INDEX_BITS - _SCALE_BITS + exponents.speed - exponents.voltage)
     pulse = single_pulse(machine, scaling.data, least)
-    return in_units(pulse, partial_pulse(machine, scaling.data, pulse), exponents)
+    return in_units(pulse, partial_pulse(machine, scaling.data, pulse, window), exponents)
 
 
 def in_units(pulse: SinglePulse, partial: PartialPulse, exponents: Exponents) -> PulseTables:

@@ -1,62 +1,250 @@
-"""The window of the torque sharing function (firmware/control/torque_sharing.h) with the least RMS current.
+"""The windows of the torque sharing function (firmware/control/torque_sharing.h) with the least RMS current, by half,
+speed and torque.
 
-Angles are electrical degrees of a phase: 180 is the unaligned, 360 the aligned position. The torque of the phases adds
-up to the reference at every angle, whatever the window; the current that it takes depends on where a phase makes its
-part. The voltage is left out: single pulse operation (single_pulse.py) has what it permits.
+Angles are electrical degrees past the begin of the half of the wanted torque: motoring from the unaligned, braking from
+the aligned position. The torque of the phases adds up to the reference at every angle, whatever the window; the current
+that it takes depends on where a phase makes its part. A window of a turn-on and a turn-off angle is enough: on machines
+by formula and by map, with pole arcs from 0.3 to 0.5 of a pitch, the best one takes at most 1.5 % more than the least
+sum of squares of the currents that make the torque at each angle.
+
+At standstill that is all. With speed the voltage limits the rate of the flux linkage: phases follow their shares as far
+as it permits, the others make up for them as in firmware/control/predictive_torque.h, and the best window is one that
+begins and ends earlier. By how much is found by simulation at the base speed; it is proportional to the speed, as is
+the angle in which a voltage builds up a flux linkage.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from salient.machine.definition import Machine
+from salient.machine.drive_data import DriveData
+from salient.machine.torque_speed import smooth_torque_Nm
+
+PARTS = (0.25, 0.5, 0.75, 1.0)
+"""Of the torque SharingWindow.torque_Nm, as MACHINE_SHARING_PARTS."""
+SPEEDS = 2
+"""Standstill and base speed, as MACHINE_SHARING_SPEEDS."""
+SMOOTH_PART = 0.97
+"""Of the least torque over a stroke of all phases at the current limit: what a window makes at every angle."""
+
 _STEP_DEG = 2.0
-_WINDOW_STEP_DEG = 4.0
-_ON_DEG = np.arange(184.0, 249.0, _WINDOW_STEP_DEG)
-_OVERLAP_MIN_DEG = 12.0
-_OFF_MAX_DEG = 356.0
+"""Divides a stroke."""
+_HALF = int(180 / _STEP_DEG)
+_TURN = 2 * _HALF
+_WINDOW_STEP_DEG = 2.0
+_ON_DEG = np.arange(0.0, 91.0, _WINDOW_STEP_DEG)
+_OVERLAP_MIN_DEG = 6.0
+_OFF_MAX_DEG = 178.0
 _SHARES = 64
 _CURRENTS = 160
-_UNREACHED = 1e3
+_FLUX_POINTS = 64
+_MISSED_COST = 1e3
+"""Relative square of the current that a part of the torque is worth which no current makes."""
+_MORE_CURRENT = 0.01
+"""Of its square, relatively, for which a window is wider: shares that change less in a control period."""
+_EARLIER_DEG = np.arange(0.0, 49.0, 4.0)
+"""By which an angle is earlier at the base speed than at standstill."""
+_LEAD_MAX_DEG = 20.0
+"""As SHARE_LEAD_MAX in firmware/control/conduction.c."""
+_RIPPLE_FREE = 0.005
+_RIPPLE_WEIGHT = 20.0
+"""Relative square of the current that a ripple beyond _RIPPLE_FREE is worth."""
+_EARLIER_WEIGHT = 1e-4
+"""That a degree is worth: where nothing else is better."""
+_UNLIMITED_Wb = 1e9
 
 
-def least_current_window_deg(magnetics: Any, phases: int, torque_Nm: float, current_max_A: float
-                             ) -> tuple[float, float]:
-    """Turn-on and turn-off of the window with the least RMS current for a torque; the widest one when no window makes
-    it with current_max_A."""
-    stroke_deg = 360.0 / phases
-    angle_deg = np.arange(180.0, 361.0, _STEP_DEG)
-    share_A = _current_of_share_A(magnetics, angle_deg, torque_Nm, current_max_A)
-    row = np.arange(len(angle_deg))
-    best_A2, best = np.inf, (float(_ON_DEG[0]), _OFF_MAX_DEG)
-    for on_deg in _ON_DEG:
-        for off_deg in np.arange(on_deg + stroke_deg + _OVERLAP_MIN_DEG, _OFF_MAX_DEG + 1.0, _WINDOW_STEP_DEG):
-            if off_deg - on_deg > 2.0 * stroke_deg:
-                break
-            share = _share(angle_deg - on_deg, stroke_deg, off_deg - on_deg - stroke_deg)
-            place = share * (_SHARES - 1)
-            low = np.minimum(place.astype(int), _SHARES - 2)
-            current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
-            square_A2 = float((current_A**2).mean())
-            if square_A2 < best_A2:
-                best_A2, best = square_A2, (float(on_deg), float(off_deg))
-    return best
+@dataclass(frozen=True, eq=False)
+class SharingWindow:
+    """Windows of a machine."""
+
+    torque_Nm: float
+    """Largest torque that a window makes at every angle, at standstill."""
+    window_deg: np.ndarray
+    """(2, SPEEDS, PARTS, 2): motoring and braking; standstill and base speed; part; turn-on and turn-off."""
+
+    def at_base_speed_deg(self, braking: bool, torque_Nm: np.ndarray) -> np.ndarray:
+        """(2, len(torque_Nm)): turn-on and turn-off for torques, as the firmware finds them."""
+        parts_Nm = np.array(PARTS) * self.torque_Nm
+        return np.array([np.interp(torque_Nm, parts_Nm, angle_deg) for angle_deg in self.window_deg[int(braking), 1].T])
 
 
-def _share(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: float) -> np.ndarray:
-    """The cubic of torque_sharing.h."""
-    rise, fall = (np.clip(since / overlap_deg, 0.0, 1.0) for since in (since_on_deg, since_on_deg - stroke_deg))
-    share: np.ndarray = rise**2 * (3.0 - 2.0 * rise) - fall**2 * (3.0 - 2.0 * fall)
-    return share
+def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
+    """The windows of a machine with the nominal voltage and the limit current_limit_A."""
+    limit_A = data.parameters["current_limit_A"]
+    torque_Nm = SMOOTH_PART * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A)
+    parts_Nm = np.array(PARTS) * torque_Nm
+    still_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])
+    phases = _Phases(machine, limit_A)
+    base_rad_s = data.speed_base_rpm * math.pi / 30.0
+    window_deg = []
+    for braking in (False, True):
+        at_rest_deg = 180.0 - still_deg[:, ::-1] if braking else still_deg
+        window_deg.append([at_rest_deg, _earlier_deg(phases, braking, base_rad_s, at_rest_deg, parts_Nm)])
+    return SharingWindow(torque_Nm, np.array(window_deg))
 
 
-def _current_of_share_A(magnetics: Any, angle_deg: np.ndarray, torque_Nm: float, current_max_A: float) -> np.ndarray:
-    """By angle and share of the torque; very large above current_max_A."""
-    grid_A = np.linspace(0.0, current_max_A, _CURRENTS)
+# --- standstill -----------------------------------------------------------------------------------------------------
+
+def _least_current_deg(machine: Machine, torque_Nm: float, limit_A: float) -> np.ndarray:
+    """Turn-on and turn-off of the motoring window with the least RMS current for a torque, or with the least torque
+    missing; the widest of those that take hardly more."""
+    stroke_deg = 360.0 / machine.phases
+    angle_deg = np.arange(0.0, 181.0, _STEP_DEG)
+    share_A = _current_of_share_A(machine.magnetics, angle_deg, torque_Nm, limit_A)
+    overlap_deg = np.arange(_OVERLAP_MIN_DEG, stroke_deg + 1.0, _WINDOW_STEP_DEG)
+    on_deg, overlap_deg = (of.ravel() for of in np.meshgrid(_ON_DEG, overlap_deg, indexing="ij"))
+    inside = on_deg + stroke_deg + overlap_deg <= _OFF_MAX_DEG
+    on_deg, overlap_deg = on_deg[inside], overlap_deg[inside]
+    place = _share(angle_deg[:, None] - on_deg, stroke_deg, overlap_deg) * (_SHARES - 1)
+    low = np.minimum(place.astype(int), _SHARES - 2)
+    row = np.arange(len(angle_deg))[:, None]
+    current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
+    cost = (current_A**2).sum(axis=0)
+    permitted = cost <= (1.0 + _MORE_CURRENT) * cost.min()
+    best = int(np.where(permitted, overlap_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
+    return np.array([on_deg[best], on_deg[best] + stroke_deg + overlap_deg[best]])
+
+
+def _current_of_share_A(magnetics: Any, angle_deg: np.ndarray, torque_Nm: float, limit_A: float) -> np.ndarray:
+    """By angle and share of the torque; above the limit the larger, the more torque is missing."""
+    grid_A = np.linspace(0.0, limit_A, _CURRENTS)
     shares_Nm = np.linspace(0.0, torque_Nm, _SHARES)
-    made_Nm = magnetics.torque_Nm((angle_deg / 360.0 * magnetics.pitch_rad)[:, None], grid_A[None, :])
+    made_Nm = magnetics.torque_Nm((angle_deg / 360.0 + 0.5)[:, None] * magnetics.pitch_rad, grid_A[None, :])
     made_Nm = np.maximum.accumulate(np.maximum(made_Nm, 0.0), axis=1)
-    current_A = np.array([np.interp(shares_Nm, row, grid_A, right=_UNREACHED * current_max_A) for row in made_Nm])
+    current_A = np.array([np.interp(shares_Nm, row, grid_A) for row in made_Nm])
+    missed = np.maximum(shares_Nm / torque_Nm - made_Nm[:, -1:] / torque_Nm, 0.0)
+    current_A = current_A + _MISSED_COST * limit_A * missed
     current_A[:, 0] = 0.0
     return current_A
+
+
+def _cubic(part: np.ndarray) -> np.ndarray:
+    x = np.clip(part, 0.0, 1.0)
+    result: np.ndarray = x * x * (3.0 - 2.0 * x)
+    return result
+
+
+def _share(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: np.ndarray) -> np.ndarray:
+    """The cubic of torque_sharing.h."""
+    return _cubic(since_on_deg / overlap_deg) - _cubic((since_on_deg - stroke_deg) / overlap_deg)
+
+
+# --- speed ----------------------------------------------------------------------------------------------------------
+
+def _earlier_deg(phases: _Phases, braking: bool, speed_rad_s: float, at_rest_deg: np.ndarray, parts_Nm: np.ndarray
+                 ) -> np.ndarray:
+    """Windows at a speed by part, from those at standstill."""
+    on_earlier, off_earlier = (of.ravel() for of in np.meshgrid(_EARLIER_DEG, _EARLIER_DEG, indexing="ij"))
+    earlier_deg = np.stack([on_earlier, off_earlier], axis=-1)
+    tried_deg = at_rest_deg[:, None] - earlier_deg
+    width_deg = tried_deg[..., 1] - tried_deg[..., 0]
+    inside = ((width_deg >= phases.stroke_deg + _OVERLAP_MIN_DEG) & (width_deg <= 2.0 * phases.stroke_deg)
+              & (tried_deg[..., 0] >= -_LEAD_MAX_DEG))
+    inside[:, 0] = True
+    part, which = np.nonzero(inside)
+    made = phases.run(braking, speed_rad_s, tried_deg[part, which], parts_Nm[part])
+    ripple = np.maximum((made.largest_Nm - made.least_Nm) / parts_Nm[part] - _RIPPLE_FREE, 0.0)
+    least_A2 = np.array([made.square_A2[part == of].min() for of in range(len(parts_Nm))])
+    # Of windows with little torque the current is small.
+    missed = np.maximum(1.0 - made.least_Nm / parts_Nm[part], 0.0)
+    cost = (made.square_A2 / least_A2[part] + _RIPPLE_WEIGHT * (ripple + missed)
+            + _EARLIER_WEIGHT * earlier_deg[which].sum(axis=1))
+    best = [int(np.where(part == of, cost, np.inf).argmin()) for of in range(len(parts_Nm))]
+    result: np.ndarray = tried_deg[part[best], which[best]]
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """By window, of all phases over a stroke."""
+
+    least_Nm: np.ndarray
+    largest_Nm: np.ndarray
+    square_A2: np.ndarray
+    """Mean of the sum of squares."""
+
+
+class _Phases:
+    """Phases that follow their shares between full voltages and up to the current limit, one step after another."""
+
+    def __init__(self, machine: Machine, limit_A: float) -> None:
+        magnetics, converter = machine.magnetics, machine.converter
+        self.phases, self.pitch_rad = machine.phases, magnetics.pitch_rad
+        self.stroke_deg = 360.0 / machine.phases
+        self.voltage_V = machine.supply_voltage_V
+        self.drop_ohm = machine.resistance_ohm + 2.0 * converter["switch_resistance_ohm"]
+        # Rows from the unaligned to the aligned position.
+        angle_rad = (np.arange(_HALF + 1) * _STEP_DEG / 360.0 + 0.5) * self.pitch_rad
+        grid_A = np.linspace(0.0, limit_A, _CURRENTS)
+        flux_Wb = np.maximum.accumulate(magnetics.flux_linkage_Wb(angle_rad[:, None], grid_A[None, :]), axis=1)
+        torque_Nm = magnetics.torque_Nm(angle_rad[:, None], grid_A[None, :])
+        torque_Nm = np.maximum.accumulate(np.maximum(torque_Nm, 0.0), axis=1)
+        fraction = np.linspace(0.0, 1.0, _FLUX_POINTS)
+        self.flux_top_Wb = flux_Wb[:, -1]
+        of_flux = [[np.interp(fraction * flux[-1], flux, of) for of in (grid_A, torque)]
+                   for flux, torque in zip(flux_Wb, torque_Nm, strict=True)]
+        self.current_A, self.torque_Nm = np.moveaxis(np.array(of_flux), 1, 0)
+        rising_Nm = self.torque_Nm + 1e-9 * torque_Nm.max() * fraction
+        self.torque_top_Nm = rising_Nm[:, -1]
+        self.flux_Wb = np.array([np.interp(fraction * row[-1], row, fraction * top)
+                                 for row, top in zip(rising_Nm, self.flux_top_Wb, strict=True)])
+
+    def run(self, braking: bool, speed_rad_s: float, window_deg: np.ndarray, torque_Nm: np.ndarray) -> _Made:
+        """Windows (lanes, 2) and torques by lane."""
+        on_deg, overlap_deg = window_deg[:, 0], window_deg[:, 1] - window_deg[:, 0] - self.stroke_deg
+        stroke = _TURN // self.phases
+        step_s = _STEP_DEG / 360.0 * self.pitch_rad / speed_rad_s
+        step_Wb = self.voltage_V * step_s
+        lane = np.arange(len(on_deg))
+        flux_Wb, current_A = np.zeros((2, self.phases, len(lane)))
+        total_Nm, square_A2 = np.zeros((stroke, len(lane))), np.zeros(len(lane))
+        for step in range(_HALF + 2 * stroke):
+            past = (step + 1 + stroke * np.arange(self.phases)) % _TURN
+            inside = ((past > 0) & (past <= _HALF))[:, None]
+            row = np.where(past <= _HALF, past, _TURN - past)
+            row = (_HALF - row if braking else row)[:, None]
+            since_on_deg = np.where(inside, past[:, None] * _STEP_DEG - on_deg, -1.0)
+            share = np.where(inside, _share(past[:, None] * _STEP_DEG - on_deg, self.stroke_deg, overlap_deg), 0.0)
+            free_Wb = flux_Wb - self.drop_ohm * step_s * current_A
+            least_Wb = np.maximum(free_Wb - step_Wb, 0.0)
+            most_Wb = np.minimum(free_Wb + step_Wb, self.flux_top_Wb[row])
+            if braking:
+                most_Wb = np.minimum(most_Wb, np.where(inside, (_HALF - past)[:, None] * step_Wb, np.inf))
+            most_Wb = np.maximum(most_Wb, least_Wb)
+            flux_Wb = np.clip(np.where(share > 0.0, self._flux_of_torque_Wb(row, share * torque_Nm), 0.0),
+                              least_Wb, most_Wb)
+            sign = np.where(inside, 1.0, -1.0)
+            made_Nm = self._at(self.torque_Nm, row, flux_Wb / self.flux_top_Wb[row])
+            missing_Nm = torque_Nm - (sign * made_Nm).sum(axis=0)
+            # A shortfall goes to the phase that entered last, an excess to the one that entered first.
+            more = missing_Nm > 0.0
+            entered = np.where(since_on_deg >= 0.0, since_on_deg, 360.0)
+            able = inside & np.where(more, flux_Wb < most_Wb, flux_Wb > least_Wb)
+            order = np.where(able, np.where(more, entered, -entered), np.inf)
+            first = order.argmin(axis=0)
+            wanted_Wb = self._flux_of_torque_Wb(row[first, 0], np.maximum(made_Nm[first, lane] + missing_Nm, 0.0))
+            corrected_Wb = np.clip(wanted_Wb, least_Wb[first, lane], most_Wb[first, lane])
+            flux_Wb[first, lane] = np.where(np.isfinite(order[first, lane]), corrected_Wb, flux_Wb[first, lane])
+            part = flux_Wb / self.flux_top_Wb[row]
+            current_A = self._at(self.current_A, row, part)
+            if step >= _HALF + stroke:
+                total_Nm[step % stroke] = (sign * self._at(self.torque_Nm, row, part)).sum(axis=0)
+                square_A2 += (current_A * current_A).sum(axis=0) / stroke
+        return _Made(total_Nm.min(axis=0), total_Nm.max(axis=0), square_A2)
+
+    def _flux_of_torque_Wb(self, row: np.ndarray, torque_Nm: np.ndarray) -> np.ndarray:
+        return self._at(self.flux_Wb, row, torque_Nm / self.torque_top_Nm[row])
+
+    @staticmethod
+    def _at(table: np.ndarray, row: np.ndarray, part: np.ndarray) -> np.ndarray:
+        place = np.clip(part, 0.0, 1.0) * (_FLUX_POINTS - 1)
+        low = np.minimum(place.astype(np.intp), _FLUX_POINTS - 2)
+        below = table[row, low]
+        result: np.ndarray = below + (place - low) * (table[row, low + 1] - below)
+        return result

@@ -21,7 +21,6 @@ import numpy as np
 
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData
-from salient.machine.sharing_window import least_current_window_deg
 
 POINTS = 17
 """As MACHINE_PULSE_POINTS: equidistant speeds per voltage, the first at standstill."""
@@ -55,8 +54,6 @@ _REST_DEG = 2.0
 """Between the end of the flux linkage and the next turn-on."""
 _CURRENT_WEIGHT = 0.05
 """Relative torque that a relative square of the RMS current is worth."""
-_SHARED_TORQUE = 0.6
-"""Of the peak torque, for which the window of torque sharing is the best one."""
 _VOLTAGE_SHARE_MAX = 0.95
 """Of the voltage that the resistance may take, and of the supply that the switches may: a current that is not reached
 is no limit."""
@@ -69,8 +66,6 @@ class SinglePulse:
     speed_per_voltage: np.ndarray
     """(POINTS,), rad/s of the rotor per volt."""
     base_speed_per_voltage: float
-    sharing_deg: tuple[float, float]
-    """Turn-on and turn-off of the window of torque sharing with the least RMS current."""
     lead_deg: np.ndarray
     """(2, POINTS), turn-on before the half of the wanted torque."""
     end_deg: np.ndarray
@@ -117,8 +112,6 @@ def single_pulse(machine: Machine, data: DriveData, speed_per_voltage_least: flo
     return SinglePulse(
         speed_per_voltage=speed_rad_s / machine.supply_voltage_V,
         base_speed_per_voltage=base_rad_s / machine.supply_voltage_V,
-        sharing_deg=least_current_window_deg(machine.magnetics, machine.phases, _SHARED_TORQUE * data.torque_peak_Nm,
-                                             data.parameters["current_limit_A"]),
         lead_deg=begin_deg - on_deg,
         end_deg=off_deg - begin_deg,
         smooth_Nm=np.maximum(smooth_Nm, 0.0),
