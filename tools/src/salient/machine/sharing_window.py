@@ -47,16 +47,21 @@ _MISSED_COST = 1e3
 """Relative square of the current that a part of the torque is worth which no current makes."""
 _MORE_CURRENT = 0.01
 """Of its square, relatively, for which a window is wider: shares that change less in a control period."""
-_EARLIER_DEG = np.arange(0.0, 49.0, 4.0)
+_EARLIER_DEG = np.arange(0.0, 49.0, 3.0)
 """By which an angle is earlier at the base speed than at standstill."""
+_WIDTH_WEIGHT = 3e-4
+"""That a degree is worth by which a window is wider: shares that change less in a control period."""
+_VOLTAGE_PART = 0.93
+"""Of the voltage: the rest is for the errors of a drive, whose torque ripples where nothing is left."""
 _LEAD_MAX_DEG = 20.0
 """As SHARE_LEAD_MAX in firmware/control/conduction.c."""
 _RIPPLE_FREE = 0.005
 _RIPPLE_WEIGHT = 20.0
 """Relative square of the current that a ripple beyond _RIPPLE_FREE is worth."""
+_FAR_DEG = 200.0
+"""Between the angles of neighbouring parts that costs as much as the current: what lies between is interpolated."""
 _EARLIER_WEIGHT = 1e-4
 """That a degree is worth: where nothing else is better."""
-_UNLIMITED_Wb = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +69,7 @@ class SharingWindow:
     """Windows of a machine."""
 
     torque_Nm: float
-    """Largest torque that a window makes at every angle, at standstill."""
+    """Largest torque of the drive that a window makes at every angle, at standstill."""
     window_deg: np.ndarray
     """(2, SPEEDS, PARTS, 2): motoring and braking; standstill and base speed; part; turn-on and turn-off."""
 
@@ -77,7 +82,8 @@ class SharingWindow:
 def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
     """The windows of a machine with the nominal voltage and the limit current_limit_A."""
     limit_A = data.parameters["current_limit_A"]
-    torque_Nm = SMOOTH_PART * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A)
+    torque_Nm = min(SMOOTH_PART * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A),
+                    data.parameters["torque_max_Nm"])
     parts_Nm = np.array(PARTS) * torque_Nm
     still_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])
     phases = _Phases(machine, limit_A)
@@ -106,9 +112,14 @@ def _least_current_deg(machine: Machine, torque_Nm: float, limit_A: float) -> np
     row = np.arange(len(angle_deg))[:, None]
     current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
     cost = (current_A**2).sum(axis=0)
-    permitted = cost <= (1.0 + _MORE_CURRENT) * cost.min()
-    best = int(np.where(permitted, overlap_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
+    best = _widest(cost, overlap_deg)
     return np.array([on_deg[best], on_deg[best] + stroke_deg + overlap_deg[best]])
+
+
+def _widest(cost: np.ndarray, width_deg: np.ndarray) -> int:
+    """Index of the widest window that costs hardly more than the least, of several the one that costs least."""
+    permitted = cost <= (1.0 + _MORE_CURRENT) * cost.min()
+    return int(np.where(permitted, width_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
 
 
 def _current_of_share_A(magnetics: Any, angle_deg: np.ndarray, torque_Nm: float, limit_A: float) -> np.ndarray:
@@ -154,10 +165,14 @@ def _earlier_deg(phases: _Phases, braking: bool, speed_rad_s: float, at_rest_deg
     # Of windows with little torque the current is small.
     missed = np.maximum(1.0 - made.least_Nm / parts_Nm[part], 0.0)
     cost = (made.square_A2 / least_A2[part] + _RIPPLE_WEIGHT * (ripple + missed)
-            + _EARLIER_WEIGHT * earlier_deg[which].sum(axis=1))
-    best = [int(np.where(part == of, cost, np.inf).argmin()) for of in range(len(parts_Nm))]
-    result: np.ndarray = tried_deg[part[best], which[best]]
-    return result
+            + _EARLIER_WEIGHT * earlier_deg[which].sum(axis=1) - _WIDTH_WEIGHT * width_deg[part, which])
+    found_deg: list[np.ndarray] = []
+    for of in range(len(parts_Nm)):
+        own_deg, own_cost = tried_deg[of, which[part == of]], cost[part == of]
+        if found_deg:
+            own_cost = own_cost + (((own_deg - found_deg[-1]) / _FAR_DEG) ** 2).sum(axis=1)
+        found_deg.append(own_deg[int(own_cost.argmin())])
+    return np.array(found_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +215,7 @@ class _Phases:
         on_deg, overlap_deg = window_deg[:, 0], window_deg[:, 1] - window_deg[:, 0] - self.stroke_deg
         stroke = _TURN // self.phases
         step_s = _STEP_DEG / 360.0 * self.pitch_rad / speed_rad_s
-        step_Wb = self.voltage_V * step_s
+        step_Wb = _VOLTAGE_PART * self.voltage_V * step_s
         lane = np.arange(len(on_deg))
         flux_Wb, current_A = np.zeros((2, self.phases, len(lane)))
         total_Nm, square_A2 = np.zeros((stroke, len(lane))), np.zeros(len(lane))
@@ -224,9 +239,8 @@ class _Phases:
             missing_Nm = torque_Nm - (sign * made_Nm).sum(axis=0)
             # A shortfall goes to the phase that entered last, an excess to the one that entered first.
             more = missing_Nm > 0.0
-            entered = np.where(since_on_deg >= 0.0, since_on_deg, 360.0)
-            able = inside & np.where(more, flux_Wb < most_Wb, flux_Wb > least_Wb)
-            order = np.where(able, np.where(more, entered, -entered), np.inf)
+            able = inside & (since_on_deg >= 0.0) & np.where(more, flux_Wb < most_Wb, flux_Wb > least_Wb)
+            order = np.where(able, np.where(more, since_on_deg, -since_on_deg), np.inf)
             first = order.argmin(axis=0)
             wanted_Wb = self._flux_of_torque_Wb(row[first, 0], np.maximum(made_Nm[first, lane] + missing_Nm, 0.0))
             corrected_Wb = np.clip(wanted_Wb, least_Wb[first, lane], most_Wb[first, lane])
