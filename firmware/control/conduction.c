@@ -40,8 +40,8 @@
 
 conduction_t conduction_initial(const torque_sharing_window_t *window) {
     return (conduction_t){
-        .half = {{.window = *window, .width = HALF_REV, .end = NO_END},
-                 {.window = *window, .width = HALF_REV, .end = HALF_REV}},
+        .half = {{.window = *window, .width = UINT32_MAX, .end = NO_END},
+                 {.window = *window, .width = UINT32_MAX, .end = HALF_REV}},
     };
 }
 
@@ -384,7 +384,7 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     const uint32_t on = state->interval.on;
     angles->ripple_q24 = negative ? fixed_subtract(0, state->ripple_q24) : state->ripple_q24;
     before->window = parameters->initial.half[0].window;
-    before->width = half->width = HALF_REV;
+    before->width = half->width = UINT32_MAX;
     before->lead = on >= HALF_REV ? -on : 0;
     angles->half[CONDUCTION_MOTORING].end = NO_END;
     angles->half[CONDUCTION_BRAKING].end = HALF_REV;

@@ -139,7 +139,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     const uint32_t reversal = ((positive != reverse) == increase) ? 0 : HALF_REV - 1;
     plan_t *corrected = NULL;
     plan_t *opposed = NULL;
-    uint32_t first = HALF_REV;
+    uint32_t first = ~reversal;
     const unsigned phases = tables->phases;
     UNROLL(4)
     for (unsigned phase = 0; phase < phases; phase++) {
@@ -224,7 +224,7 @@ static inline bool plan_phase(const predictive_torque_parameters_t *parameters, 
                               const period_t *period, const conduction_half_t *half, int32_t torque, bool outgoing,
                               plan_t *p) {
     const uint32_t since_on = p->angle - half->window.turn_on;
-    p->since_on = since_on < half->width ? since_on : HALF_REV;
+    p->since_on = since_on < half->width ? since_on : UINT32_MAX;
     const uint32_t remaining = outgoing ? p->angle - HALF_REV : ~p->angle; /* until it leaves the half */
     if (remaining < half->lead) {
         plan_lead(tables, p, removable_flux(period, half->lead - remaining), parameters->current_limit_q9);
@@ -276,7 +276,7 @@ static inline int32_t drop_plan(plan_t *p, int32_t shortfall) {
     p->v_q13 = 0;
     p->flux = 0;
     p->torque = 0;
-    p->since_on = HALF_REV;
+    p->since_on = UINT32_MAX;
     return fixed_add(shortfall, torque);
 }
 
