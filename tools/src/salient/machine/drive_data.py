@@ -35,6 +35,8 @@ PEAK_OF_MAP = 0.65
 KNEELESS_SPEED_RPM = 1500.0
 SMOOTH_SHARE = 0.8
 """Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
+WINDOW_SHARE = 0.97
+"""Part of it that the windows of torque sharing make at every angle at low speed."""
 PEAK_OF_RATED = 1.2
 CURRENT_RANGE_A = 80.0
 """Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
@@ -249,6 +251,17 @@ def _within(row: ParameterDefinition, value: float) -> float:
     return min(max(value, low), high) if row.unit in SAME_UNITS else value
 
 
+def _torque_max(machine: Machine, data: dict[str, Any]) -> tuple[float, str]:
+    """torque_max_Nm and its formula."""
+    peak_Nm = data["torque_peak_Nm"]
+    if "torque_peak_Nm" in machine.drive or "torque_rated_Nm" in machine.drive:
+        return peak_Nm, "torque_peak_Nm"
+    limit_A = machine.drive_parameters.get("current_limit_A", data["current_peak_A"])
+    window_Nm = WINDOW_SHARE * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A)
+    return max(peak_Nm, window_Nm), (f"{WINDOW_SHARE:g} * least torque over a stroke of all phases at current_limit_A, "
+                                     "at least torque_peak_Nm; torque_peak_Nm where the file states torques")
+
+
 def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tuple[float, str]]:
     peak_A, peak_Nm, rated_Nm = data["current_peak_A"], data["torque_peak_Nm"], data["torque_rated_Nm"]
     period_s, inertia = 1.0 / data["control_rate_hz"], machine.inertia_kg_m2
@@ -266,7 +279,7 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     gain = min(8.0 / rated_Nm, 0.6 / step_40_kHz_Nm)
     gain_text = "min(8 / torque_rated_Nm, 0.6 / torque_step_Nm at 40 kHz)"
     return {
-        "torque_max_Nm": (peak_Nm, "torque_peak_Nm"),
+        "torque_max_Nm": _torque_max(machine, data),
         "current_limit_A": (peak_A, "current_peak_A"),
         "current_trip_A": (trip_A,
                            "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "

@@ -22,15 +22,13 @@ from typing import Any
 import numpy as np
 
 from salient.machine.definition import Machine
-from salient.machine.drive_data import DriveData
+from salient.machine.drive_data import WINDOW_SHARE, DriveData
 from salient.machine.torque_speed import smooth_torque_Nm
 
 PARTS = (0.25, 0.5, 0.75, 1.0)
 """Of the torque SharingWindow.torque_Nm, as MACHINE_SHARING_PARTS."""
 SPEEDS = 2
 """Standstill and base speed, as MACHINE_SHARING_SPEEDS."""
-SMOOTH_PART = 0.97
-"""Of the least torque over a stroke of all phases at the current limit: what a window makes at every angle."""
 
 _STEP_DEG = 2.0
 """Divides a stroke."""
@@ -82,7 +80,7 @@ class SharingWindow:
 def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
     """The windows of a machine with the nominal voltage and the limit current_limit_A."""
     limit_A = data.parameters["current_limit_A"]
-    torque_Nm = min(SMOOTH_PART * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A),
+    torque_Nm = min(WINDOW_SHARE * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A),
                     data.parameters["torque_max_Nm"])
     parts_Nm = np.array(PARTS) * torque_Nm
     still_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])

@@ -42,7 +42,7 @@ _BRAKING_ON_DEG, _BRAKING_OFF_DEG = (198, 366), (372, 546)
 _LATER_ON_DEG = 60
 """Turn-on angles after these, of parts of the largest torque."""
 _MOTORING_OFF_MAX_DEG = 353.0
-_SMOOTH_OFF_DEG = np.arange(240.0, 353.0, 8.0)
+_SMOOTH_OFF_DEG = np.append(np.arange(240.0, 353.0, 8.0), 358.0)
 _FINE_DEG = 0.25
 """Of the braking envelope."""
 _FLUX_POINTS = 48
