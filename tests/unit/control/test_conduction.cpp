@@ -23,6 +23,7 @@ constexpr unsigned PHASES = 3;
 constexpr double SPEED_MAX_RAD_S = 320.0, SUPPLY_V = 240.0; // of the last point
 constexpr double OVER_VOLTAGE_V = 300.0, FOLD_BACK_V = 7.0, TORQUE_MAX_NM = 40.0;
 constexpr double BASE_INDEX = 6.0;
+constexpr double SHARING_TORQUE_NM = 24.0;
 constexpr double GAIN_PER_STEP = 2.5;
 
 double signed_rev(uint32_t angle) {
@@ -41,6 +42,16 @@ machine_tables_t tables_of() {
     tables.pulse_base_index = uint16_t(BASE_INDEX * Q8);
     // index = |w| / w_max * 16 * V_supply / V, in Q8.
     tables.pulse_index_scale = uint32_t(16 * Q8 / (SPEED_MAX_RAD_S * Q22) * (SUPPLY_V * Q6) * Q32);
+    tables.sharing_torque = uint16_t(SHARING_TORQUE_NM * Q8);
+    for (unsigned braking = 0; braking < 2; braking++) {
+        for (unsigned speed = 0; speed < MACHINE_SHARING_SPEEDS; speed++) {
+            for (unsigned part = 0; part < MACHINE_SHARING_PARTS; part++) {
+                tables.sharing[braking][speed][part] = {
+                    .on = int16_t(6000 - 900 * int(part) - 3000 * int(speed) - 500 * int(braking)),
+                    .off = int16_t(30000 + 500 * int(part) - 2000 * int(speed) - 800 * int(braking))};
+            }
+        }
+    }
     for (unsigned k = 0; k < MACHINE_PULSE_POINTS; k++) {
         for (unsigned braking = 0; braking < 2; braking++) {
             tables.pulse[braking][k] = {.lead = uint16_t(400 * k + 500 * braking),
@@ -104,6 +115,7 @@ struct model_t {
     double torque_min = 0.0, torque_max = 0.0, gain_excess = 0.0, ripple = 0.0;
     double link = 1.0;
     bool longer = false; // pulses where the link limits
+    bool own_windows = false;
     double turn_on_lead = 0.0, enter = 0.0, leave = 0.0, envelope_end = 0.0, envelope_flux_Wb = 0.0;
 
     template <typename value_of_t> double at(double index, value_of_t value_of) const {
@@ -190,7 +202,20 @@ struct model_t {
         torque_min = -(s.speed < 0.0 ? motoring_max : braking_max);
 
         const auto blend = [](double from, double to, double part) { return from + part * (to - from); };
-        if (braking) {
+        if (own_windows) {
+            const double place = std::clamp(4.0 * torque / SHARING_TORQUE_NM - 1.0, 0.0, 3.0);
+            const unsigned low = std::min(unsigned(place), 2u);
+            const double speed = std::min(index / BASE_INDEX, 1.0);
+            const auto window = [&](auto angle_of) {
+                const auto at_speed = [&](unsigned k) {
+                    const machine_sharing_window_t *of = tables.sharing[braking][k];
+                    return blend(angle_of(of[low]), angle_of(of[low + 1]), place - low) / 65536.0;
+                };
+                return blend(at_speed(0), at_speed(1), speed);
+            };
+            enter = window([](const machine_sharing_window_t &of) { return double(of.on); });
+            leave = window([](const machine_sharing_window_t &of) { return double(of.off); });
+        } else if (braking) {
             enter = 0.5 - sharing_off;
             leave = 0.5 - sharing_on;
         } else {
@@ -271,7 +296,7 @@ class Conduction : public testing::Test {
         EXPECT_NEAR(state.part_q15 / Q15, model.part, LEVEL) << of;
         EXPECT_TRUE(state.single_pulse == model.single_pulse || model.at_threshold) << of;
         const bool bounded = model.partial > 0.0 || (state.level_q15 > 0 && !model.braking);
-        EXPECT_EQ(half.width, bounded ? half.window.stroke + half.window.overlap : 1u << 31) << of;
+        EXPECT_EQ(half.width, bounded ? half.window.stroke + half.window.overlap : UINT32_MAX) << of;
         const bool envelope = (state.level_q15 > 0 || model.partial > 0.0) && model.braking;
         EXPECT_NEAR(1.0 - angles().half[CONDUCTION_BRAKING].end / REV, envelope ? model.envelope_end : 0.5, 1e-4) << of;
         EXPECT_NEAR(half.flux * 8 / Q29, envelope ? model.envelope_flux_Wb : 0.0, 1e-4) << of;
@@ -284,8 +309,9 @@ class Conduction : public testing::Test {
 
 TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages) {
     unsigned sharing = 0, blended = 0, full = 0, longer = 0;
-    for (const double direction : {1.0, -1.0, 2.0, -2.0}) {
-        parameters.longer_pulses = std::fabs(direction) > 1.0 ? 3 : 0;
+    for (const double direction : {1.0, -1.0, 2.0, -2.0, 3.0, -3.0}) { // 1 and -1: one pulse length; 3 and -3: own windows
+        parameters.longer_pulses = std::fabs(direction) == 2.0 ? 3 : 0;
+        parameters.own_windows = std::fabs(direction) == 3.0;
         for (const double sign : {1.0, -1.0}) {
             for (const double of_last : {0.0, 0.2, 0.41, 0.5, 0.75, 1.0, 1.4}) {
                 for (const double voltage : {160.0, 240.0, 288.0, 296.0, 310.0}) {
@@ -293,6 +319,7 @@ TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages
                         conduction_reset(&parameters, &state);
                         model_t model{tables};
                         model.longer = parameters.longer_pulses > 0;
+                        model.own_windows = parameters.own_windows;
                         const double speed = std::copysign(of_last * SPEED_MAX_RAD_S, direction);
                         const sample_t s{sign * torque, sign * 0.9 * torque, sign * 0.1 * torque, speed,
                                          voltage,       of_last * 0.1};
@@ -361,6 +388,23 @@ TEST_F(Conduction, without_single_pulses_windows_advance_and_no_phase_leads) {
     EXPECT_NEAR(angles().half[CONDUCTION_MOTORING].window.turn_on / REV, 160.0 / 360.0, 1e-3);
 }
 
+TEST_F(Conduction, own_windows_follow_torque_and_speed_and_no_shortfall) {
+    parameters.own_windows = true;
+    const auto turn_on_deg = [&](double torque, double shortfall, double speed) {
+        for (unsigned k = 0; k < 60; k++) {
+            update({torque, torque - shortfall, shortfall, speed, SUPPLY_V, 0.0});
+        }
+        return (angles().half[CONDUCTION_MOTORING].window.turn_on / REV - 0.5) * 360.0;
+    };
+    const double still_deg = 6000.0 / 65536.0 * 360.0, part_deg = 900.0 / 65536.0 * 360.0;
+    const double base_deg = 3000.0 / 65536.0 * 360.0, base_speed = BASE_INDEX / 16.0 * SPEED_MAX_RAD_S;
+    EXPECT_NEAR(turn_on_deg(0.5, 0.0, 2.5), still_deg, 0.4);
+    EXPECT_NEAR(turn_on_deg(6.0, 4.0, 2.5), still_deg, 0.4) << "a shortfall that no voltage causes";
+    EXPECT_NEAR(turn_on_deg(12.0, 0.0, 2.5), still_deg - part_deg, 0.4);
+    EXPECT_NEAR(turn_on_deg(12.0, 0.0, 0.5 * base_speed), still_deg - part_deg - 0.5 * base_deg, 0.3);
+    EXPECT_NEAR(turn_on_deg(12.0, 0.0, 0.99 * base_speed), still_deg - part_deg - base_deg, 0.3);
+}
+
 TEST_F(Conduction, no_braking_torque_is_permitted_from_the_over_voltage_on) {
     for (const double direction : {1.0, -1.0}) {
         update({0.0, 0.0, 0.0, direction * 200.0, 300.0, 0.06});
@@ -408,6 +452,15 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
                     }
                 }
             }
+            for (auto &half : tables.sharing) {
+                for (auto &speed : half) {
+                    for (machine_sharing_window_t &window : speed) {
+                        window = {int16_t(int(random() % 16000) - 4000), int16_t(16384 + random() % 16000)};
+                    }
+                }
+            }
+            tables.sharing_torque = uint16_t(1 + random() % 65535);
+            parameters.own_windows = k % 300 != 0;
             tables.pulse_base_index = uint16_t(1 + random() % 4096);
             tables.pulse_index_scale = random() >> 1;
             parameters.longer_pulses = k % 200 == 0 ? 3 : 0;

@@ -87,13 +87,14 @@ struct placed_t {
 const tables_t TABLES;
 const int32_t NO_MISALIGNMENT[HAL_PHASES_MAX] = {};
 
-// Without single pulse operation.
+// Without single pulse operation, constant windows.
 torque_parameters_t parameters_of(double reserve_Nm = 0.0, double current_limit_A = 52.0, bool sharing = true) {
     parameters_t p;
     parameters_init(&p);
     p.values[PARAMETER_TORQUE_RESERVE_NM] = to_fixed(reserve_Nm, Q24);
     p.values[PARAMETER_CURRENT_LIMIT_A] = to_fixed(current_limit_A, Q9);
     p.values[PARAMETER_TORQUE_SHARING] = sharing;
+    p.values[PARAMETER_SHARE_ON_ANGLE_DEG] = 184 << 7;
     control_parameters_t c = configure_control(&p, &machine_tables, RATE_HZ, 17, 12, fixed_point::TIMER_CLOCK_HZ);
     c.conduction.single_pulse = false;
     return {c.predictive, c.conduction, c.conduction.initial};

@@ -198,10 +198,20 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(share.overlapping, p.values[PARAMETER_TORQUE_SHARING] == 1);
     near("stroke", share.stroke, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(share.stroke - stroke), 1.0);
-    ASSERT_LE(std::fabs(share.turn_on - pitch(PARAMETER_SHARE_ON_ANGLE_DEG)), 1.0);
-    ASSERT_LE(std::fabs(share.turn_off - share.turn_on - width), 4.0) << "at least 2 degrees of overlap";
-    ASSERT_LE(std::fabs(share.turn_on_advance - on_early), 1.0);
-    ASSERT_LE(std::fabs(share.turn_off_advance - on_early - narrowing), 4.0) << "at full advance, too";
+    const bool own_windows = v(PARAMETER_SHARE_ON_ANGLE_DEG) < 180.0;
+    ASSERT_EQ(c.conduction.own_windows, own_windows);
+    if (own_windows) { // that of the largest torque stands for them
+        const machine_sharing_window_t &widest = machine_tables.sharing[0][0][MACHINE_SHARING_PARTS - 1];
+        ASSERT_EQ(share.turn_on - (1u << 31), uint32_t(widest.on) << 16);
+        ASSERT_EQ(share.turn_off - (1u << 31), uint32_t(widest.off) << 16);
+        ASSERT_EQ(share.turn_on_advance, 0u);
+        ASSERT_EQ(share.turn_off_advance, 0u);
+    } else {
+        ASSERT_LE(std::fabs(share.turn_on - pitch(PARAMETER_SHARE_ON_ANGLE_DEG)), 1.0);
+        ASSERT_LE(std::fabs(share.turn_off - share.turn_on - width), 4.0) << "at least 2 degrees of overlap";
+        ASSERT_LE(std::fabs(share.turn_on_advance - on_early), 1.0);
+        ASSERT_LE(std::fabs(share.turn_off_advance - on_early - narrowing), 4.0) << "at full advance, too";
+    }
     near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
     near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * fixed_point::Q24, 0.0);
     near("flux gain", c.predictive.flux.gain_q30, v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q30, 0.0);

@@ -129,6 +129,8 @@ TEST_F(Deferred, a_pending_step_keeps_its_input_and_the_next_input_counts_the_sk
 }
 
 TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
+    parameters.conduction.own_windows = false;
+    parameters.conduction.sharing.turn_on_advance = 1u << 28;
     start();
     for (int k = 0; k < 400; k++) {
         period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move

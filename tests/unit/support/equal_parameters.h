@@ -61,6 +61,7 @@ inline const char *difference(const control_parameters_t &a, const control_param
     COMPARE(conduction.sharing.turn_on_advance)
     COMPARE(conduction.sharing.turn_off_advance)
     COMPARE(conduction.initial)
+    COMPARE(conduction.own_windows)
     COMPARE(conduction.single_pulse)
     COMPARE(conduction.torque_min_q24)
     COMPARE(conduction.torque_max_q24)

@@ -5,6 +5,7 @@
 extern "C" {
 #include "control/bp_pid.h"
 #include "control/load_observer.h"
+#include "control/machine_tables.h"
 #include "control/misalignment.h"
 #include "control/moving_load.h"
 #include "control/observer_bandwidth.h"
@@ -86,6 +87,25 @@ inline torque_sharing_t model_of(const torque_sharing_parameters_t &p, double ad
     return {.turn_on = on, .stroke = stroke, .overlap = p.overlapping ? off - on - stroke : 0.0};
 }
 
+// From the tables of a machine; control_rate_hz of the periods.
+inline own_windows_t own_windows_of(const machine_tables_t &tables, double control_rate_hz) {
+    using namespace fixed_point;
+    own_windows_t model{};
+    for (unsigned half = 0; half < 2; half++) {
+        for (unsigned speed = 0; speed < MACHINE_SHARING_SPEEDS; speed++) {
+            for (unsigned part = 0; part < MACHINE_SHARING_PARTS; part++) {
+                const machine_sharing_window_t &of = tables.sharing[half][speed][part];
+                model.window[half][speed][part] = {of.on / 65536.0, of.off / 65536.0};
+            }
+        }
+    }
+    model.torque = tables.sharing_torque / 256.0;
+    const double base_rad_s_per_V =
+        std::ldexp(double(tables.pulse_base_index), 32) / double(tables.pulse_index_scale) * 64.0 / Q22;
+    model.base_step_per_V = base_rad_s_per_V / (2.0 * PI) * tables.rotor_poles / control_rate_hz;
+    return model;
+}
+
 template <typename machine_t>
 predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const conduction_parameters_t &conduction,
                                  const machine_t *machine, unsigned phases) {
@@ -101,6 +121,8 @@ predictive_t<machine_t> model_of(const predictive_torque_parameters_t &p, const 
     model.sharing = conduction.sharing.overlapping;
     model.base_window = model_of(conduction.sharing, 0.0);
     model.advanced_window = model_of(conduction.sharing, 1.0);
+    model.has_own_windows = conduction.own_windows;
+    model.own_windows = own_windows_of(machine_tables, 1.0 / model.period_s);
     return model;
 }
 

@@ -192,6 +192,28 @@ inline double flux_step(double flux, double gain, double table, double applied, 
     return std::max(flux + gain * (table - flux) + applied - drop, 0.0);
 }
 
+// Windows of torque sharing over torque and speed: motoring and braking, standstill and base speed, quarters of a torque.
+struct own_windows_t {
+    struct window_t {
+        double on, off; // past the begin of the half, electrical rev
+    };
+    std::array<std::array<std::array<window_t, 4>, 2>, 2> window{};
+    double torque = 0.0, base_step_per_V = 0.0; // electrical rev per period and volt at the base speed
+
+    torque_sharing_t at(double magnitude, double step_per_V, bool braking, double stroke) const {
+        const double place = std::clamp(4.0 * magnitude / torque - 1.0, 0.0, 3.0);
+        const unsigned low = std::min(unsigned(place), 2u);
+        const double speed = std::min(step_per_V / base_step_per_V, 1.0), part = place - low;
+        const auto between = [&](double window_t::*angle) {
+            const auto &still = window[braking][0], &base = window[braking][1];
+            return (1.0 - speed) * ((1.0 - part) * (still[low].*angle) + part * (still[low + 1].*angle)) +
+                   speed * ((1.0 - part) * (base[low].*angle) + part * (base[low + 1].*angle));
+        };
+        const double on = between(&window_t::on), off = between(&window_t::off);
+        return {.turn_on = braking ? 1.0 - off : 0.5 + on, .stroke = stroke, .overlap = off - on - stroke};
+    }
+};
+
 // Predictive torque control with exact inverses: no cell limits how far an operating point moves. machine_t models a
 // phase, angles in electrical revolutions from 0.5 (unaligned) to 1:
 // torque(angle, A), flux(angle, A), current_of_torque(angle, N m) and current_of_flux(angle, Wb).
@@ -201,7 +223,8 @@ template <typename machine_t> struct predictive_t {
     unsigned phases;
     double period_s, resistance_ohm, flux_gain, current_limit_A, reserve_Nm;
     torque_sharing_t base_window, advanced_window; // without and with full advance
-    bool sharing = true;
+    bool sharing = true, has_own_windows = false;
+    own_windows_t own_windows{};
     std::array<double, PHASES_MAX> flux{}, duty{};
     double advance = 0.0, torque_shortfall = 0.0;
 
@@ -234,8 +257,13 @@ template <typename machine_t> struct predictive_t {
                     std::max(std::min(p.flux_max, flux_step_max * (p.angle - 0.5) / sample.angle_step), p.flux_min);
             }
             // Windows are advanced for motoring torque only.
-            const bool advanced = p.positive != sample.reverse && (reference < 0.0) == sample.reverse;
-            const torque_sharing_t share = advanced ? window() : base_window;
+            const bool braking = (reference < 0.0) != sample.reverse;
+            const bool advanced = p.positive != sample.reverse && !braking;
+            const bool own = has_own_windows && p.positive == (reference >= 0.0);
+            const torque_sharing_t share =
+                own ? own_windows.at(std::fabs(reference), sample.angle_step / sample.bus_V, braking, base_window.stroke)
+                : advanced ? window()
+                           : base_window;
             p.since_on = p.angle - share.turn_on;
             const double side = p.positive ? reference : -reference;
             limited |= plan_torque(p, (std::max(side, 0.0) + opposed) * share.at(p.angle));
@@ -269,6 +297,9 @@ template <typename machine_t> struct predictive_t {
                 sharing ? base_window.overlap + advance * (advanced_window.overlap - base_window.overlap) : 0.0};
     }
 
+    // Angle past turn-on within a revolution.
+    static double order_of(const plan_t &p) { return p.since_on < 0.0 ? p.since_on + 1.0 : p.since_on; }
+
     // Shortfall that advances the windows: above 0.05 N m and 1/64 of the reference.
     void move_windows(double reference) {
         const bool voltage_limited = std::fabs(torque_shortfall) > 0.05 + std::fabs(reference) / 64.0;
@@ -293,7 +324,8 @@ template <typename machine_t> struct predictive_t {
     }
 
     // One phase takes the shortfall or excess: of the half of the reference, the one that entered last or first and is
-    // not at its limit; when none is, an opposed one may reduce its torque.
+    // not at its limit; where it is the last, one before its turn-on when no other is; and then an opposed one may
+    // reduce its torque.
     void correct_torque(bool positive, bool reverse) {
         const bool increase = (torque_shortfall > 0.0) == positive;
         const bool latest_is_least = positive != reverse;
@@ -302,8 +334,9 @@ template <typename machine_t> struct predictive_t {
             plan_t &p = plan[phase];
             if (p.positive != positive) {
                 opposed = p.limit >= 0 && p.torque > 0.0 ? &p : opposed;
-            } else if (p.since_on >= 0.0 && p.limit != (increase ? 1 : -1) &&
-                       (corrected == nullptr || (p.since_on < corrected->since_on) == (latest_is_least == increase))) {
+            } else if (p.limit != (increase ? 1 : -1) && (p.since_on >= 0.0 || latest_is_least == increase) &&
+                       (corrected == nullptr ||
+                        (order_of(p) < order_of(*corrected)) == (latest_is_least == increase))) {
                 corrected = &p;
             }
         }
