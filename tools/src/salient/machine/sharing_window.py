@@ -43,8 +43,9 @@ _CURRENTS = 160
 _FLUX_POINTS = 64
 _MISSED_COST = 1e3
 """Relative square of the current that a part of the torque is worth which no current makes."""
-_MORE_CURRENT = 0.01
-"""Of its square, relatively, for which a window is wider: shares that change less in a control period."""
+_MORE_AT_REST, _MORE_AT_SPEED = 0.03, 0.01
+"""Of the square of the current, relatively, for which a window is wider: the torque of phases that share a revolution
+more evenly depends less on errors of angle and tables. At speed the voltage takes as much again."""
 _EARLIER_DEG = np.arange(0.0, 49.0, 3.0)
 """By which an angle is earlier at the base speed than at standstill."""
 _WIDTH_WEIGHT = 3e-4
@@ -83,21 +84,21 @@ def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
     torque_Nm = min(WINDOW_SHARE * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A),
                     data.parameters["torque_max_Nm"])
     parts_Nm = np.array(PARTS) * torque_Nm
-    still_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])
+    found_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])
     phases = _Phases(machine, limit_A)
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
     window_deg = []
     for braking in (False, True):
-        at_rest_deg = 180.0 - still_deg[:, ::-1] if braking else still_deg
-        window_deg.append([at_rest_deg, _earlier_deg(phases, braking, base_rad_s, at_rest_deg, parts_Nm)])
+        of_half_deg = 180.0 - found_deg[..., ::-1] if braking else found_deg
+        window_deg.append([of_half_deg[:, 1], _earlier_deg(phases, braking, base_rad_s, of_half_deg[:, 0], parts_Nm)])
     return SharingWindow(torque_Nm, np.array(window_deg))
 
 
 # --- standstill -----------------------------------------------------------------------------------------------------
 
 def _least_current_deg(machine: Machine, torque_Nm: float, limit_A: float) -> np.ndarray:
-    """Turn-on and turn-off of the motoring window with the least RMS current for a torque, or with the least torque
-    missing; the widest of those that take hardly more."""
+    """Turn-on and turn-off of the motoring windows for a torque: (2, 2), the widest of those with hardly more than the
+    least RMS current, or the least torque missing: to begin with at speed, and at rest."""
     stroke_deg = 360.0 / machine.phases
     angle_deg = np.arange(0.0, 181.0, _STEP_DEG)
     share_A = _current_of_share_A(machine.magnetics, angle_deg, torque_Nm, limit_A)
@@ -110,13 +111,13 @@ def _least_current_deg(machine: Machine, torque_Nm: float, limit_A: float) -> np
     row = np.arange(len(angle_deg))[:, None]
     current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
     cost = (current_A**2).sum(axis=0)
-    best = _widest(cost, overlap_deg)
-    return np.array([on_deg[best], on_deg[best] + stroke_deg + overlap_deg[best]])
+    chosen = [_widest(cost, overlap_deg, more) for more in (_MORE_AT_SPEED, _MORE_AT_REST)]
+    return np.stack([on_deg[chosen], on_deg[chosen] + stroke_deg + overlap_deg[chosen]], axis=-1)
 
 
-def _widest(cost: np.ndarray, width_deg: np.ndarray) -> int:
-    """Index of the widest window that costs hardly more than the least, of several the one that costs least."""
-    permitted = cost <= (1.0 + _MORE_CURRENT) * cost.min()
+def _widest(cost: np.ndarray, width_deg: np.ndarray, more: float) -> int:
+    """Index of the widest window that costs little more than the least, of several the one that costs least."""
+    permitted = cost <= (1.0 + more) * cost.min()
     return int(np.where(permitted, width_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
 
 

@@ -259,6 +259,11 @@ GROUPS: dict[str, Group] = {
                             speed_range.partial_torque,
                             (("rms_to_best", ""), ("phase_rms_A", ""), ("torque_error_percent", ""), ("ripple", "")),
                             long=True),
+    "copper": Group("parts of the rated torque on a held shaft up to base speed, 40 kHz", speed_range.copper,
+                    (("copper_to_least", ""), ("ripple", ""), ("torque_error_percent", ""))),
+    "copper_random": Group("parts of the rated torque on a held shaft up to base speed, random machines of narrow pole"
+                           " arcs, 40 kHz", speed_range.copper_random,
+                           (("copper_to_least", ""), ("ripple", ""), ("torque_error_percent", "")), long=True),
     "transition": Group("load steps at 1.5 and 0.5 times the base speed, ramps between 0.5 and 2 times under load, 40"
                         " kHz", speed_range.transition,
                         (("dip_ratio", ""), ("speed_dip_rpm", ""), ("recovery_time_s", ""), ("torque_step_percent", ""),

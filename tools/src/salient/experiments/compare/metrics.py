@@ -96,6 +96,7 @@ METRICS = {
     "torque_error_percent": Metric("error of the mean torque", "%", 2, 0.1),
     "phase_rms_A": Metric("RMS current of a phase", "A", 2, 0.1),
     "rms_to_best": Metric("RMS current", "of the best pulse's", 3, 0.01),
+    "copper_to_least": Metric("sum of squares of the currents", "of the least without ripple", 3, 0.003),
     "dip_ratio": Metric("speed drop by load", "of that at half base speed", 2, 0.05),
     "torque_step_percent": Metric("largest torque step between strokes", "% of load", 2, 0.3),
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
@@ -174,12 +175,16 @@ def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
 
 
 def held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """A run of speed_range.py; so are the next three."""
+    """A run of speed_range.py; so are the next four."""
     return speed_range.held_metrics(scenario, recording)
 
 
 def held_part_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     return speed_range.held_part_metrics(scenario, recording)
+
+
+def held_copper_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return speed_range.held_copper_metrics(scenario, recording)
 
 
 def fast_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -304,6 +309,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "moving": moving_metrics,
     "held": held_metrics,
     "held_part": held_part_metrics,
+    "held_copper": held_copper_metrics,
     "fast_step": fast_step_metrics,
     "speed_ramps": speed_ramps_metrics,
     "step_and_ripple": step_and_ripple_metrics,

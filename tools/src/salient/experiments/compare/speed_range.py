@@ -1,9 +1,12 @@
-"""Runs over the whole range of speeds, above base speed too, judged by a bound of the torque that shares no code with
-the firmware or its tables (reference/torque_speed_bound.py).
+"""Runs over the whole range of speeds, above base speed too, judged by bounds that share no code with the firmware or
+its tables (reference/torque_speed_bound.py, reference/copper_bound.py).
 
 - torque_speed: the largest torque in torque mode, motoring and braking, on a shaft that a dynamometer holds.
 - torque_speed_random: the same with ten random machines, which no other group has.
 - partial_torque: parts of it above base speed; the RMS current is compared with that of the best pulse.
+- copper: parts of the rated torque up to base speed; the sum of squares of the currents is compared with the least one
+  without ripple at that speed.
+- copper_random: the same with random machines of narrow pole arcs, by map.
 - transition: load steps at 1.5 times and half of the base speed in one run; speed ramps under load between half and
   twice the base speed.
 - torque_conditions: the largest torque with control rates, encoders and supplies.
@@ -24,6 +27,7 @@ from salient.config import CONTROLLERS
 from salient.experiments import metrics
 from salient.experiments.compare import every_machine
 from salient.experiments.compare.case import MACHINES, Case, make_scenario
+from salient.experiments.compare.random_maps import random_map_files
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep, TorqueStep
 from salient.machine.definition import Machine
 from salient.machine.drive_data import DriveData, derive
@@ -31,6 +35,7 @@ from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table
 from salient.machine.path import stated_conditions
 from salient.machine.scaling import Scaling, choose
+from salient.reference.copper_bound import least_square_A2
 from salient.reference.torque_speed_bound import (
     BRAKING,
     MOTORING,
@@ -51,6 +56,9 @@ PARTS = (0.25, 0.5, 0.75)
 MOTORING_SHORT_PERCENT, BRAKING_SHORT_PERCENT = 3.0, 8.0
 """By which the mean torque may be below its bound."""
 PEAK_TO_LIMIT_MAX = 1.03
+UP_TO_BASE, UP_TO_BASE_QUICK = (0.1, 0.5, 1.0), (0.1,)
+COPPER_RATIO_MAX, COPPER_RIPPLE_MAX = 1.06, 0.045
+"""Of the ripple: of single samples of a machine of 8/6 poles at its base speed, in 27 control periods of a stroke."""
 RMS_RATIO_MAX, TORQUE_ERROR_MAX_PERCENT = 1.1, 3.0
 
 SLOW, FAST = 0.5, 1.5
@@ -111,6 +119,22 @@ def partial_torque(quick: bool, machines: Sequence[str] = MACHINES) -> Iterator[
                     condition = f"{subject.label}, {speed_rpm:g} r/min, {quadrant}, {100.0 * part:g} %"
                     yield Case("partial_torque", condition, "salient", "held_part",
                                subject.held(speed_rpm, sign * _three_digits(part * largest_Nm)))
+
+
+def copper(quick: bool, machines: Sequence[str] = MACHINES, group: str = "copper") -> Iterator[Case]:
+    """Parts of the rated torque up to base speed."""
+    for machine in machines[:1] if quick else machines:
+        subject = _Subject(machine)
+        for speed_rpm in subject.speeds_rpm(UP_TO_BASE_QUICK if quick else UP_TO_BASE):
+            for part in PARTS:
+                torque_Nm = _three_digits(part * subject.data.torque_rated_Nm)
+                yield Case(group, f"{subject.label}, {speed_rpm:g} r/min, {100.0 * part:g} %", "salient",
+                           "held_copper", subject.held(speed_rpm, torque_Nm))
+
+
+def copper_random(quick: bool) -> Iterator[Case]:
+    """Parts of the rated torque of random machines of narrow pole arcs."""
+    return copper(quick, [str(path) for path in random_map_files()], "copper_random")
 
 
 def transition(quick: bool, machines: Sequence[str] = MACHINES) -> Iterator[Case]:
@@ -246,7 +270,7 @@ def of_any_machine(quick: bool, path: str) -> Iterator[Case]:
     return torque_speed(quick, (path,), "machines", ("salient",), OF_BASE_ANY)
 
 
-GROUPS = {"torque_speed": torque_speed, "partial_torque": partial_torque, "transition": transition,
+GROUPS = {"torque_speed": torque_speed, "partial_torque": partial_torque, "copper": copper, "transition": transition,
           "torque_conditions": torque_conditions}
 """With --machine, a machine's own cases instead of those of the paper's machine in its terms."""
 
@@ -278,6 +302,20 @@ def held_part_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     best_A = _least_rms_A(scenario.machine, scenario.bench["held_speed_rpm"], _limits(scenario), round(mean_Nm, 3))
     return {"torque_error_percent": 100.0 * abs(mean_Nm / step.value_Nm - 1.0), "phase_rms_A": rms_A,
             "rms_to_best": rms_A / best_A if math.isfinite(best_A) else None,
+            "ripple": float(np.ptp(torque_Nm)) / abs(mean_Nm) if mean_Nm else None}
+
+
+def held_copper_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
+    """Sum of squares of the currents relative to the least one of the same mean torque without ripple, the torque's
+    error and ripple."""
+    (step,) = scenario.torque
+    limits = _limits(scenario)
+    torque_Nm = np.asarray(recording["torque_Nm"], dtype=float)
+    mean_Nm = float(torque_Nm.mean())
+    square_A2 = sum(float(np.mean(np.square(current, dtype=float))) for current in _currents(recording))
+    bound_A2 = _least_square_A2(scenario.machine, scenario.bench["held_speed_rpm"], limits, float(f"{mean_Nm:.3g}"))
+    return {"torque_error_percent": 100.0 * abs(mean_Nm / step.value_Nm - 1.0),
+            "copper_to_least": square_A2 / bound_A2 if math.isfinite(bound_A2) else None,
             "ripple": float(np.ptp(torque_Nm)) / abs(mean_Nm) if mean_Nm else None}
 
 
@@ -334,6 +372,11 @@ def _largest(name: str, speed_rpm: float, limits: Limits, quadrant: int) -> Puls
 @lru_cache(maxsize=1024)
 def _least_rms_A(name: str, speed_rpm: float, limits: Limits, torque_Nm: float) -> float:
     return least_current(_machine(name), speed_rpm, limits, [torque_Nm])[0].rms_A
+
+
+@lru_cache(maxsize=1024)
+def _least_square_A2(name: str, speed_rpm: float, limits: Limits, torque_Nm: float) -> float:
+    return least_square_A2(_machine(name), torque_Nm, speed_rpm / _RPM, limits.supply_V, limits.current_A)
 
 
 @lru_cache

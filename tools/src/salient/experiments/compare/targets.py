@@ -212,6 +212,10 @@ _EVERY_CONDITION = {
                              ("peak_to_limit", speed_range.PEAK_TO_LIMIT_MAX))},
     ("partial_torque", "rms_to_best", ""): Target(speed_range.RMS_RATIO_MAX),
     ("partial_torque", "torque_error_percent", ""): Target(speed_range.TORQUE_ERROR_MAX_PERCENT),
+    **{(group, metric, ""): Target(limit) for group in ("copper", "copper_random")
+       for metric, limit in (("copper_to_least", speed_range.COPPER_RATIO_MAX),
+                             ("ripple", speed_range.COPPER_RIPPLE_MAX),
+                             ("torque_error_percent", speed_range.TORQUE_ERROR_MAX_PERCENT))},
     ("transition", "dip_ratio", ""): Target(speed_range.DIP_RATIO_MAX),
     ("transition", "torque_step_percent", ""): Target(speed_range.TORQUE_STEP_MAX_PERCENT),
 }
