@@ -74,7 +74,9 @@ def test_reported_torque_is_what_the_other_phases_make(make_bench, machine, cont
     mean_Nm = degraded(bench, "torque_mean_Nm")
     assert 12.0 < mean_Nm < 17.0
     assert torque_Nm.mean() == pytest.approx(mean_Nm, rel=0.06)
-    assert degraded(bench, "torque_least_Nm") == pytest.approx(torque_Nm.min(), abs=0.05)
+    # With windows up to the aligned position a current ends a little past it.
+    assert torque_Nm.min() > -0.6
+    assert degraded(bench, "torque_least_Nm") == pytest.approx(max(torque_Nm.min(), 0.0), abs=0.05)
 
 
 def test_loss_of_a_phase_is_a_fault_by_default(make_bench):

@@ -73,7 +73,8 @@ def test_every_target_belongs_to_a_row():
 def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
         salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold",
-                                                "torque_speed_random", "partial_torque", "transition",
+                                                "torque_speed_random", "partial_torque", "copper", "copper_random",
+                                                "transition",
                                                 "torque_conditions")}
         expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},
                     "compressor": {"paper", "salient"}}
@@ -791,7 +792,7 @@ def test_groups_are_listed():
     assert code == 0
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
     assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
-        "torque_speed_random", "partial_torque", "transition", "torque_conditions", "encoders", "misalignment",
+        "torque_speed_random", "partial_torque", "copper_random", "transition", "torque_conditions", "encoders", "misalignment",
         "standing_error", "hold", "ablation", "robustness", "machines"]
 
 

@@ -97,9 +97,9 @@ def test_reaching_law_is_as_steep_as_a_short_start_needs_and_never_more_than_the
             path.write_text(random_machine(int(path.stem[-2:])))
         machine = load_machine(path)
         data = derive(machine)
-        acceleration = data.torque_peak_Nm / machine.inertia_kg_m2
+        acceleration = data.parameters["torque_max_Nm"] / machine.inertia_kg_m2
         start_s = data.speed_base_rpm * math.pi / 30.0 / acceleration
-        followed_s = (data.torque_peak_Nm / data.torque_step_Nm + 3.0) / data.control_rate_hz
+        followed_s = (data.parameters["torque_max_Nm"] / data.torque_step_Nm + 3.0) / data.control_rate_hz
         delta_s = data.parameters["smc_delta"]
         assert 0.3 < delta_s <= 1.0001 * max(1.0, 0.1 / start_s)
         assert delta_s * acceleration * followed_s <= 8.001

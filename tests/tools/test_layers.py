@@ -32,7 +32,7 @@ PYTHON_LAYERS = (
     "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",
     "salient.dbc", "salient.toml_file",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
-    "salient.generate", "salient.reference.torque_speed_bound",
+    "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
     "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",

@@ -273,13 +273,14 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     step_40_kHz_Nm = step_Nm / period_s / 40_000.0
     base_rad_s = data["speed_base_rpm"] / _RPM
     over_V, over_V_formula = _over_voltage(machine, data["supply_max_V"])
-    acceleration = peak_Nm / inertia
-    torque_removed_s = (peak_Nm / step_Nm + 3.0) * period_s
+    largest_Nm, largest_text = _torque_max(machine, data)
+    acceleration = largest_Nm / inertia
+    torque_removed_s = (largest_Nm / step_Nm + 3.0) * period_s
     kp = min(1000.0 * inertia, peak_Nm / (0.015 * base_rad_s))
     gain = min(8.0 / rated_Nm, 0.6 / step_40_kHz_Nm)
     gain_text = "min(8 / torque_rated_Nm, 0.6 / torque_step_Nm at 40 kHz)"
     return {
-        "torque_max_Nm": _torque_max(machine, data),
+        "torque_max_Nm": (largest_Nm, largest_text),
         "current_limit_A": (peak_A, "current_peak_A"),
         "current_trip_A": (trip_A,
                            "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
@@ -294,9 +295,9 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "speed_kp": (kp, "min(1000/s * inertia, torque_peak_Nm / 1.5 % of speed_base_rpm)"),
         "speed_ki": (50.0 * kp, "50/s * speed_kp"),
         "smc_k": (min(max(0.0275 / period_s, 40.0 * acceleration / base_rad_s), 0.12 / period_s),
-                  "max(0.0275 / Ts, 40 torque_peak_Nm / (inertia * speed_base_rpm)), at most 0.12 / Ts"),
+                  "max(0.0275 / Ts, 40 torque_max_Nm / (inertia * speed_base_rpm)), at most 0.12 / Ts"),
         "smc_delta": (min(max(1.0, 0.1 * acceleration / base_rad_s), 8.0 / (acceleration * torque_removed_s)),
-                      "max(1, 0.1 s a / speed_base_rpm), at most 8 / (a (torque_peak_Nm / torque_step_Nm + 3) Ts)"),
+                      "max(1, 0.1 s a / speed_base_rpm), at most 8 / (a (torque_max_Nm / torque_step_Nm + 3) Ts)"),
         "observer_bandwidth_rad_s": (min(0.025 / period_s, 8000.0), "0.025 / Ts"),
         "observer_wake_rad_s": (min(0.225 / period_s, 10_000.0), "0.225 / Ts, at most 10000"),
         "observer_moving_rad_s": (min(0.045 / period_s, 10_000.0), "0.045 / Ts, at most 10000"),
