@@ -12,6 +12,7 @@ from typing import Any
 
 from salient.config import DEFAULTS
 from salient.machine.definition import Machine
+from salient.machine.least_current import WINDOW_SHARE, least_current_deg
 from salient.machine.parameter_table import SAME_UNITS, ParameterDefinition, read_table
 from salient.machine.torque_speed import (
     current_of_torque_A,
@@ -35,12 +36,12 @@ PEAK_OF_MAP = 0.65
 KNEELESS_SPEED_RPM = 1500.0
 SMOOTH_SHARE = 0.8
 """Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
-WINDOW_SHARE = 0.97
-"""Part of it that the windows of torque sharing make at every angle at low speed."""
 PEAK_OF_RATED = 1.2
 CURRENT_RANGE_A = 80.0
 """Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
 _CURRENT_SEARCHED_A = 10_000.0
+_MORE_CURRENT = 0.01
+"""Of the square of the current, relatively, for which a window is wider."""
 _RPM = 30.0 / math.pi
 
 
@@ -262,6 +263,17 @@ def _torque_max(machine: Machine, data: dict[str, Any]) -> tuple[float, str]:
                                      "at least torque_peak_Nm; torque_peak_Nm where the file states torques")
 
 
+def _commutation_deg(machine: Machine, data: dict[str, Any]) -> tuple[float, float]:
+    """Turn-on and turn-off of the window of torque sharing for the rated torque, of which the latter stays the same:
+    the outgoing phase is switched off as a whole. 180 unaligned, 360 aligned."""
+    on_deg, off_deg = least_current_deg(machine.magnetics, machine.phases, data["torque_rated_Nm"],
+                                        data["current_peak_A"], _MORE_CURRENT)
+    flux_Wb = machine.magnetics.unaligned_inductance_H * data["current_rated_A"]
+    built_deg = math.degrees(0.5 * data["speed_base_rpm"] / _RPM * machine.rotor_poles
+                             * flux_Wb / machine.supply_voltage_V)
+    return max(180.0 + float(on_deg) - built_deg, 180.0), 180.0 + float(off_deg)
+
+
 def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tuple[float, str]]:
     peak_A, peak_Nm, rated_Nm = data["current_peak_A"], data["torque_peak_Nm"], data["torque_rated_Nm"]
     period_s, inertia = 1.0 / data["control_rate_hz"], machine.inertia_kg_m2
@@ -274,6 +286,8 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
     base_rad_s = data["speed_base_rpm"] / _RPM
     over_V, over_V_formula = _over_voltage(machine, data["supply_max_V"])
     largest_Nm, largest_text = _torque_max(machine, data)
+    stroke_deg = 360.0 / machine.phases
+    on_deg, off_deg = _commutation_deg(machine, data)
     acceleration = largest_Nm / inertia
     torque_removed_s = (largest_Nm / step_Nm + 3.0) * period_s
     kp = min(1000.0 * inertia, peak_Nm / (0.015 * base_rad_s))
@@ -288,6 +302,11 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "bus_over_voltage_V": (over_V, over_V_formula),
         "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
         "over_speed_rpm": (1.2 * data["speed_max_rpm"], "1.2 speed_max_rpm"),
+        "turn_on_angle_deg": (on_deg, "180 + on less the angle in which V builds up Lu current_rated_A at half of "
+                              "speed_base_rpm, at least 180"),
+        "turn_off_angle_deg": (on_deg + stroke_deg, "turn_on_angle_deg + stroke"),
+        "outgoing_off_angle_deg": (max(off_deg, on_deg + stroke_deg), "180 + off"),
+        "hand_over_angle_deg": (max(off_deg - stroke_deg, on_deg), "outgoing_off_angle_deg - stroke"),
         "torque_band_inner_Nm": (max(rated_Nm / 160.0, step_Nm / 40.0),
                                  "max(torque_rated_Nm / 160, torque_step_Nm / 40)"),
         "torque_band_outer_Nm": (max(rated_Nm / 16.0, step_Nm / 4.0),

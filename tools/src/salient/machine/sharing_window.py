@@ -2,12 +2,7 @@
 speed and torque.
 
 Angles are electrical degrees past the begin of the half of the wanted torque: motoring from the unaligned, braking from
-the aligned position. The torque of the phases adds up to the reference at every angle, whatever the window; the current
-that it takes depends on where a phase makes its part. A window of a turn-on and a turn-off angle is enough: on machines
-by formula and by map, with pole arcs from 0.3 to 0.5 of a pitch, the best one takes at most 1.5 % more than the least
-sum of squares of the currents that make the torque at each angle.
-
-At standstill that is all. With speed the voltage limits the rate of the flux linkage: phases follow their shares as far
+the aligned position. At standstill they are those of least_current.py. With speed the voltage limits the rate of the flux linkage: phases follow their shares as far
 as it permits, the others make up for them as in firmware/control/predictive_torque.h, and the best window is one that
 begins and ends earlier. By how much is found by simulation at the base speed; it is proportional to the speed, as is
 the angle in which a voltage builds up a flux linkage.
@@ -17,12 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from salient.machine.definition import Machine
-from salient.machine.drive_data import WINDOW_SHARE, DriveData
+from salient.machine.drive_data import DriveData
+from salient.machine.least_current import OVERLAP_MIN_DEG, WINDOW_SHARE, least_current_deg, sharing_function
 from salient.machine.torque_speed import smooth_torque_Nm
 
 PARTS = (0.25, 0.5, 0.75, 1.0)
@@ -34,15 +29,8 @@ _STEP_DEG = 2.0
 """Divides a stroke."""
 _HALF = int(180 / _STEP_DEG)
 _TURN = 2 * _HALF
-_WINDOW_STEP_DEG = 2.0
-_ON_DEG = np.arange(0.0, 91.0, _WINDOW_STEP_DEG)
-_OVERLAP_MIN_DEG = 6.0
-_OFF_MAX_DEG = 178.0
-_SHARES = 64
 _CURRENTS = 160
 _FLUX_POINTS = 64
-_MISSED_COST = 1e3
-"""Relative square of the current that a part of the torque is worth which no current makes."""
 _MORE_AT_REST, _MORE_AT_SPEED = 0.03, 0.01
 """Of the square of the current, relatively, for which a window is wider: the torque of phases that share a revolution
 more evenly depends less on errors of angle and tables. At speed the voltage takes as much again."""
@@ -84,7 +72,8 @@ def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
     torque_Nm = min(WINDOW_SHARE * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A),
                     data.parameters["torque_max_Nm"])
     parts_Nm = np.array(PARTS) * torque_Nm
-    found_deg = np.array([_least_current_deg(machine, of_Nm, limit_A) for of_Nm in parts_Nm])
+    found_deg = np.array([[least_current_deg(machine.magnetics, machine.phases, of_Nm, limit_A, more)
+                           for more in (_MORE_AT_SPEED, _MORE_AT_REST)] for of_Nm in parts_Nm])
     phases = _Phases(machine, limit_A)
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
     window_deg = []
@@ -92,57 +81,6 @@ def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
         of_half_deg = 180.0 - found_deg[..., ::-1] if braking else found_deg
         window_deg.append([of_half_deg[:, 1], _earlier_deg(phases, braking, base_rad_s, of_half_deg[:, 0], parts_Nm)])
     return SharingWindow(torque_Nm, np.array(window_deg))
-
-
-# --- standstill -----------------------------------------------------------------------------------------------------
-
-def _least_current_deg(machine: Machine, torque_Nm: float, limit_A: float) -> np.ndarray:
-    """Turn-on and turn-off of the motoring windows for a torque: (2, 2), the widest of those with hardly more than the
-    least RMS current, or the least torque missing: to begin with at speed, and at rest."""
-    stroke_deg = 360.0 / machine.phases
-    angle_deg = np.arange(0.0, 181.0, _STEP_DEG)
-    share_A = _current_of_share_A(machine.magnetics, angle_deg, torque_Nm, limit_A)
-    overlap_deg = np.arange(_OVERLAP_MIN_DEG, stroke_deg + 1.0, _WINDOW_STEP_DEG)
-    on_deg, overlap_deg = (of.ravel() for of in np.meshgrid(_ON_DEG, overlap_deg, indexing="ij"))
-    inside = on_deg + stroke_deg + overlap_deg <= _OFF_MAX_DEG
-    on_deg, overlap_deg = on_deg[inside], overlap_deg[inside]
-    place = _share(angle_deg[:, None] - on_deg, stroke_deg, overlap_deg) * (_SHARES - 1)
-    low = np.minimum(place.astype(int), _SHARES - 2)
-    row = np.arange(len(angle_deg))[:, None]
-    current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
-    cost = (current_A**2).sum(axis=0)
-    chosen = [_widest(cost, overlap_deg, more) for more in (_MORE_AT_SPEED, _MORE_AT_REST)]
-    return np.stack([on_deg[chosen], on_deg[chosen] + stroke_deg + overlap_deg[chosen]], axis=-1)
-
-
-def _widest(cost: np.ndarray, width_deg: np.ndarray, more: float) -> int:
-    """Index of the widest window that costs little more than the least, of several the one that costs least."""
-    permitted = cost <= (1.0 + more) * cost.min()
-    return int(np.where(permitted, width_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
-
-
-def _current_of_share_A(magnetics: Any, angle_deg: np.ndarray, torque_Nm: float, limit_A: float) -> np.ndarray:
-    """By angle and share of the torque; above the limit the larger, the more torque is missing."""
-    grid_A = np.linspace(0.0, limit_A, _CURRENTS)
-    shares_Nm = np.linspace(0.0, torque_Nm, _SHARES)
-    made_Nm = magnetics.torque_Nm((angle_deg / 360.0 + 0.5)[:, None] * magnetics.pitch_rad, grid_A[None, :])
-    made_Nm = np.maximum.accumulate(np.maximum(made_Nm, 0.0), axis=1)
-    current_A = np.array([np.interp(shares_Nm, row, grid_A) for row in made_Nm])
-    missed = np.maximum(shares_Nm / torque_Nm - made_Nm[:, -1:] / torque_Nm, 0.0)
-    current_A = current_A + _MISSED_COST * limit_A * missed
-    current_A[:, 0] = 0.0
-    return current_A
-
-
-def _cubic(part: np.ndarray) -> np.ndarray:
-    x = np.clip(part, 0.0, 1.0)
-    result: np.ndarray = x * x * (3.0 - 2.0 * x)
-    return result
-
-
-def _share(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: np.ndarray) -> np.ndarray:
-    """The cubic of torque_sharing.h."""
-    return _cubic(since_on_deg / overlap_deg) - _cubic((since_on_deg - stroke_deg) / overlap_deg)
 
 
 # --- speed ----------------------------------------------------------------------------------------------------------
@@ -154,7 +92,7 @@ def _earlier_deg(phases: _Phases, braking: bool, speed_rad_s: float, at_rest_deg
     earlier_deg = np.stack([on_earlier, off_earlier], axis=-1)
     tried_deg = at_rest_deg[:, None] - earlier_deg
     width_deg = tried_deg[..., 1] - tried_deg[..., 0]
-    inside = ((width_deg >= phases.stroke_deg + _OVERLAP_MIN_DEG) & (width_deg <= 2.0 * phases.stroke_deg)
+    inside = ((width_deg >= phases.stroke_deg + OVERLAP_MIN_DEG) & (width_deg <= 2.0 * phases.stroke_deg)
               & (tried_deg[..., 0] >= -_LEAD_MAX_DEG))
     inside[:, 0] = True
     part, which = np.nonzero(inside)
@@ -224,7 +162,7 @@ class _Phases:
             row = np.where(past <= _HALF, past, _TURN - past)
             row = (_HALF - row if braking else row)[:, None]
             since_on_deg = np.where(inside, past[:, None] * _STEP_DEG - on_deg, -1.0)
-            share = np.where(inside, _share(past[:, None] * _STEP_DEG - on_deg, self.stroke_deg, overlap_deg), 0.0)
+            share = np.where(inside, sharing_function(past[:, None] * _STEP_DEG - on_deg, self.stroke_deg, overlap_deg), 0.0)
             free_Wb = flux_Wb - self.drop_ohm * step_s * current_A
             least_Wb = np.maximum(free_Wb - step_Wb, 0.0)
             most_Wb = np.minimum(free_Wb + step_Wb, self.flux_top_Wb[row])
