@@ -156,17 +156,17 @@ typedef struct {
     int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
-    int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
-    int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
-    int32_t missing_sum_q21; /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
-    int32_t above_base_q15;  /* from the base speed to 1.125 of it, Q1.15, 0..1 */
-    int32_t partial_q15;     /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
-    int32_t advance_q30;     /* of the windows, Q1.30, 0..1 */
-    int32_t trim_q30;        /* of the level, Q1.30, -1..1 */
-    int32_t level_q15;       /* Q1.15, 0..1 */
-    int32_t part_q15;        /* of the largest mean torque, Q1.15, 0..1 */
-    bool single_pulse;       /* the torque pulsates, or a phase turns on before its half */
-    uint16_t way_q15;        /* from a braking pulse to one without a torque, Q1.15, 0..1 */
+    int32_t gain_excess_q31;      /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
+    int32_t torque_q24;           /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
+    int32_t missing_sum_q21;      /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
+    int32_t above_base_q15;       /* from the base speed to 1.125 of it, Q1.15, 0..1 */
+    int32_t partial_q15;          /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
+    int32_t advance_q30;          /* of the windows, Q1.30, 0..1 */
+    int32_t trim_q30;             /* of the level, Q1.30, -1..1 */
+    int32_t level_q15;            /* Q1.15, 0..1 */
+    int32_t part_q15;             /* of the largest mean torque, Q1.15, 0..1 */
+    bool single_pulse;            /* the torque pulsates, or a phase turns on before its half */
+    uint16_t way_q15;             /* from a braking pulse to one without a torque, Q1.15, 0..1 */
     conduction_sharing_t sharing; /* from the tables */
     conduction_part_t part;
     conduction_interval_t interval; /* of the half with the torque */

@@ -82,8 +82,8 @@ typedef struct {
     uint8_t ripple;
 } machine_partial_pulse_t;
 
-/* Windows of torque sharing up to the base speed (tools/src/salient/machine/sharing_window.py): at standstill and at the
- * base speed, for 1/4, 1/2, 3/4 and all of the largest torque that they make at every angle. */
+/* Windows of torque sharing up to the base speed (tools/src/salient/machine/sharing_window.py): at standstill and at
+ * the base speed, for 1/4, 1/2, 3/4 and all of the largest torque that they make at every angle. */
 #define MACHINE_SHARING_SPEEDS 2
 #define MACHINE_SHARING_PARTS 4
 

@@ -31,8 +31,9 @@ OTHERS = sorted((ROOT / "tools" / "examples" / "machines").glob("*.toml"))
 def test_bundled_machines_keep_the_defaults_of_the_firmware(path):
     data = derive(load_machine(path))
     own = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "winding_current_A"}
-    if path.stem == "finite_element":  # light: its reaching law is faster
-        own |= {"smc_k", "smc_delta"}
+    if path.stem == "finite_element":  # light: its reaching law is faster; poles overlap later than the paper's
+        own |= {"smc_k", "smc_delta", "turn_on_angle_deg", "turn_off_angle_deg", "outgoing_off_angle_deg",
+                "hand_over_angle_deg"}
         assert data.parameters["smc_k"] == pytest.approx(1213, rel=0.001)
         assert data.parameters["smc_delta"] == pytest.approx(2.92, rel=0.01)
     for row in read_table():

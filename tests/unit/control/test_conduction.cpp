@@ -309,7 +309,8 @@ class Conduction : public testing::Test {
 
 TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages) {
     unsigned sharing = 0, blended = 0, full = 0, longer = 0;
-    for (const double direction : {1.0, -1.0, 2.0, -2.0, 3.0, -3.0}) { // 1 and -1: one pulse length; 3 and -3: own windows
+    for (const double direction :
+         {1.0, -1.0, 2.0, -2.0, 3.0, -3.0}) { // 1 and -1: one pulse length; 3 and -3: own windows
         parameters.longer_pulses = std::fabs(direction) == 2.0 ? 3 : 0;
         parameters.own_windows = std::fabs(direction) == 3.0;
         for (const double sign : {1.0, -1.0}) {

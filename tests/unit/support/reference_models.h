@@ -192,7 +192,8 @@ inline double flux_step(double flux, double gain, double table, double applied, 
     return std::max(flux + gain * (table - flux) + applied - drop, 0.0);
 }
 
-// Windows of torque sharing over torque and speed: motoring and braking, standstill and base speed, quarters of a torque.
+// Windows of torque sharing over torque and speed: motoring and braking, standstill and base speed, quarters of a
+// torque.
 struct own_windows_t {
     struct window_t {
         double on, off; // past the begin of the half, electrical rev
@@ -260,10 +261,10 @@ template <typename machine_t> struct predictive_t {
             const bool braking = (reference < 0.0) != sample.reverse;
             const bool advanced = p.positive != sample.reverse && !braking;
             const bool own = has_own_windows && p.positive == (reference >= 0.0);
-            const torque_sharing_t share =
-                own ? own_windows.at(std::fabs(reference), sample.angle_step / sample.bus_V, braking, base_window.stroke)
-                : advanced ? window()
-                           : base_window;
+            const torque_sharing_t share = own ? own_windows.at(std::fabs(reference), sample.angle_step / sample.bus_V,
+                                                                braking, base_window.stroke)
+                                           : advanced ? window()
+                                                      : base_window;
             p.since_on = p.angle - share.turn_on;
             const double side = p.positive ? reference : -reference;
             limited |= plan_torque(p, (std::max(side, 0.0) + opposed) * share.at(p.angle));
