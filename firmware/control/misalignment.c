@@ -63,6 +63,15 @@ int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torqu
     return fixed_subtract(load_torque_q24, fixed_multiply_shift(speed_correction_q22, inertia_rate_q8, 6));
 }
 
+int32_t misalignment_slope_q24(const misalignment_t *misalignment) {
+    int32_t sum_q24 = 0;
+    UNROLL(4)
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        sum_q24 = fixed_add(sum_q24, misalignment->phase[i].slope_q24);
+    }
+    return sum_q24;
+}
+
 static int32_t limited_step_q10(int32_t step_q10) {
     return fixed_clamp(step_q10, -STEP_MAX_Q10, STEP_MAX_Q10);
 }
@@ -122,6 +131,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     const int32_t current_q9 = sample->current_q9;
     const int32_t slope_q24 =
         current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle, current_q9, 2 * parameters->probe_angle) : 0;
+    phase->slope_q24 = slope_q24;
     const int32_t filter_q16 = fixed_clamp(
         fixed_multiply_high((int32_t)(sample->bandwidth_rad_s << 16), parameters->filter_q32), 0, FILTER_GAIN_MAX_Q16);
     low_pass_step(&phase->slope_lag1_q24, slope_q24, filter_q16);

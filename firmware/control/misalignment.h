@@ -61,6 +61,7 @@ typedef struct {
 } misalignment_parameters_t;
 
 typedef struct {
+    int32_t slope_q24; /* s_j at the last update: N m per 0.02 rad, Q7.24 */
     int32_t slope_lag1_q24, slope_lag2_q24,
         slope_mean_q24;                  /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
     int64_t last_sum_q24;                /* disturbance_sum_q24 at the last update of the phase */
@@ -119,6 +120,9 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
 /* y in N m, Q7.24, from J / Ts (misalignment_parameters_t), load torque (N m, Q7.24) and speed correction (rad/s,
  * Q9.22) of the load observer. */
 int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22);
+
+/* Sum of the phases' slopes at their last updates, N m per 0.02 rad, Q7.24, saturates. */
+int32_t misalignment_slope_q24(const misalignment_t *misalignment);
 
 /* Offsets and filters 0. */
 void misalignment_reset(misalignment_t *misalignment);

@@ -1,8 +1,10 @@
 #include "control/slow_counts.h"
 
+#include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
+#include "fixed/formats.h"
 
 #define SLOW_HZ 2000u
 #define SLOW_BITS_MAX 12u
@@ -10,12 +12,23 @@
 #define PERIODS_MAX (UINT32_C(1) << 20)
 #define ONE_Q28 (1 << 28)
 
+/* Slopes are in N m per 0.02 rad. */
+#define SLOPES_PER_RAD INT64_C(50)
+
+/* Range of u in which the fit of slow_counts.h is one, and of t / 4 ms, Q8: 0.5 s. */
+#define U_MIN_Q8 (-576)
+#define U_MAX_Q8 (36 << 8)
+#define Z_MAX_Q8 (1u << 15)
+
 slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigned encoder_bits, int32_t inertia_q30) {
+    const int64_t slope_gain_q46 = (SLOPES_PER_RAD << 46) / (DEADBEAT_HZ * DEADBEAT_HZ);
     const uint32_t deadbeat_periods = control_rate_hz / DEADBEAT_HZ; /* below 2^13 */
     return (slow_counts_parameters_t){
         .slow_periods = encoder_bits <= SLOW_BITS_MAX ? control_rate_hz / SLOW_HZ : UINT32_MAX,
         .deadbeat_periods = deadbeat_periods,
+        .count = UINT32_C(1) << (32u - encoder_bits),
         .step_q31 = (uint32_t)INT32_MAX / deadbeat_periods,
+        .slope_gain_q16 = fixed_saturate(fixed_divide(slope_gain_q46, inertia_q30) << machine_tables.speed_exponent),
         .deadbeat = load_observer_deadbeat_gains(DEADBEAT_HZ, inertia_q30),
     };
 }
@@ -34,22 +47,34 @@ static void set_narrow(const slow_counts_parameters_t *parameters, uint32_t peri
     gains->load_gain_q28 = product_q31(parameters->deadbeat.load_gain_q28, x_q31 / 2);
 }
 
+/* The factor of l2 for a slope of the torque, by u = slope t^2 / J, Q12. */
+static int32_t slope_factor_q12(const slow_counts_parameters_t *parameters, uint32_t periods, int32_t slope_q24) {
+    const uint32_t ratio_q8 = (periods << 8) / parameters->deadbeat_periods;
+    const int32_t z_q8 = (int32_t)(ratio_q8 < Z_MAX_Q8 ? ratio_q8 : Z_MAX_Q8);
+    const int32_t of_4_ms_q24 = fixed_product_shift_saturate(slope_q24, parameters->slope_gain_q16, 16);
+    const int32_t u_q8 = fixed_clamp(fixed_multiply_high(of_4_ms_q24, z_q8 * z_q8), U_MIN_Q8, U_MAX_Q8);
+    return ((ONE_Q16 + 48 * u_q8) << 12) / (ONE_Q16 + (15 * u_q8 >> 1));
+}
+
 /* q = 0: l2 and l3 by the time between the edges. */
-static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t periods, load_observer_gains_t *gains) {
+static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t periods, int32_t slope_q24,
+                         load_observer_gains_t *gains) {
     const int32_t y_q31 = (int32_t)(((parameters->deadbeat_periods << 16) / periods) << 15);
     gains->angle_gain_q28 = ONE_Q28;
-    gains->speed_gain_q24 = product_q31(parameters->deadbeat.speed_gain_q24, y_q31);
+    gains->speed_gain_q24 = fixed_product_shift_saturate(product_q31(parameters->deadbeat.speed_gain_q24, y_q31),
+                                                         slope_factor_q12(parameters, periods, slope_q24), 12);
     gains->load_gain_q28 = product_q31(product_q31(parameters->deadbeat.load_gain_q28, y_q31), y_q31 / 2);
 }
 
 NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts,
-                               uint32_t encoder_angle, uint32_t periods) {
+                               uint32_t encoder_angle, uint32_t angle, uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
     counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
+    counts->interval = angle - encoder_angle < parameters->count ? counts->periods : counts->interval;
     const bool long_since = passed >= parameters->slow_periods;
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;
-        counts->periods = 0;
+        counts->periods = counts->interval = 0;
         counts->slow = long_since;
     } else if (long_since) {
         counts->slow = true;
@@ -58,14 +83,15 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
 }
 
 NOINLINE void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
-                              slow_counts_results_t *results) {
-    const uint32_t coming = counts->periods + 1u;
+                              int32_t slope_q24, slow_counts_results_t *results) {
+    const uint32_t coming = counts->interval + 1u;
     results->encoder_angle = counts->encoder_angle;
+    results->late = coming > parameters->deadbeat_periods;
     results->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
-    if (coming <= parameters->deadbeat_periods) {
+    if (!results->late) {
         set_narrow(parameters, coming, &results->edge);
     } else {
-        set_deadbeat(parameters, coming, &results->edge);
+        set_deadbeat(parameters, coming, slope_q24, &results->edge);
     }
 }
 
@@ -80,5 +106,5 @@ NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const 
 
 const load_observer_gains_t *slow_counts_gains(const slow_counts_parameters_t *parameters,
                                                const slow_counts_results_t *results, uint32_t encoder_angle) {
-    return encoder_angle != results->encoder_angle ? &results->edge : &parameters->deadbeat;
+    return encoder_angle != results->encoder_angle || results->late ? &results->edge : &parameters->deadbeat;
 }

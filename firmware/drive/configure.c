@@ -490,6 +490,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .torque_max_q24 = torque_max_q24,
     });
     control.slow_counts = slow_counts_configure(control_rate_hz, encoder_bits, inertia_q30);
+    control.count_course = count_course_configure(control.observer.angle_step_q32, encoder_bits);
     /* With a transducer the whole load is fed forward already. */
     const bool learns_load =
         values[PARAMETER_PERIODIC_LOAD] != 0 && !control.load_from_transducer && control.moving_load.stages > 0;

@@ -20,6 +20,7 @@
 #include "control/applied_flux.h"
 #include "control/commutation.h"
 #include "control/conduction.h"
+#include "control/count_course.h"
 #include "control/ditc_hysteresis.h"
 #include "control/inertia.h"
 #include "control/load_observer.h"
@@ -100,6 +101,7 @@ typedef struct {
     torque_mode_parameters_t torque_mode;
     inertia_parameters_t inertia;
     slow_counts_parameters_t slow_counts;
+    count_course_parameters_t count_course;
     encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
     int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
     bool scale_by_shaft;          /* and by the acceleration of the shaft, shaft_torque.h */
@@ -160,6 +162,7 @@ typedef struct {
     uint32_t updates_since_near;      /* since the speed was first near it */
     bool approaches_reference;        /* until then, and for some more */
     slow_counts_t slow_counts;
+    count_course_t count_course;
 } deferred_t;
 
 /* Half a millisecond in which the observer may slip. */

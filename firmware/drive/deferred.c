@@ -79,6 +79,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->encoder_angle = measured->encoder_angle;
     input->dc_link_voltage_q6 = measured->dc_link_voltage_q6;
     input->command_age_us = sample->time_us - command->time_us;
+    input->angle = (uint32_t)(state->observer.angle_q64 >> 32);
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
     input->torque_reference_q24 = state->torque_reference_q24;
@@ -145,10 +146,12 @@ NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, 
                                         const deferred_input_t *input, deferred_results_t *results) {
     results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
                                                        parameters->bandwidth.trigger_stage_count};
-    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->periods)) {
+    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle,
+                          input->periods)) {
         return false;
     }
-    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, &results->slow_counts);
+    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, misalignment_slope_q24(&deferred->misalignment),
+                    &results->slow_counts);
     if (deferred->mode == DRIVE_MODE_SPEED) {
         speed_control_limit_uncertain(parameters, input->load_torque_q24, &results->speed);
     }
@@ -329,7 +332,7 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
 NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                        const deferred_input_t *input, uint32_t periods) {
     if (parameters->bandwidth.adaptive && !deferred->slow_counts.slow) {
-        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, periods);
+        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle, periods);
     }
 }
 

@@ -33,7 +33,8 @@ typedef struct {
     uint32_t encoder_angle;     /* start of the encoder count, 2^-32 rev */
     int32_t dc_link_voltage_q6; /* V, Q9.6 */
     uint32_t command_age_us;    /* time since the last accepted command */
-    int32_t speed_q22;          /* observer, for the coming sample, rad/s, Q9.22 */
+    uint32_t angle;             /* observer, for the coming sample, 2^-32 rev */
+    int32_t speed_q22;          /* likewise, rad/s, Q9.22 */
     /* With an adaptive bandwidth only. */
     observer_bandwidth_sample_t bandwidth;
     bool run;                     /* state RUN */

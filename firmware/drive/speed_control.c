@@ -27,6 +27,16 @@ static int32_t limited_pi_q24(const control_parameters_t *parameters, deferred_t
     return limited_q24;
 }
 
+/* With fast counts and at the begin of a run the course is the angle itself. */
+static int32_t course_q22(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+    if (!deferred->run || !deferred->slow_counts.slow) {
+        count_course_begin(&deferred->count_course, input->angle);
+        return 0;
+    }
+    return count_course_step(&parameters->count_course, &deferred->count_course, deferred->speed_reference_q22,
+                             input->angle, input->periods);
+}
+
 static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input, const command_t *command, int32_t limit_q24) {
     const int32_t commanded_q22 = command->request == COMMAND_RUN ? command->speed_reference_q22 : 0;
@@ -36,7 +46,8 @@ static int32_t speed_law_q24(const control_parameters_t *parameters, deferred_t 
     const int32_t target_q22 = speed_control_limited_q22(parameters, commanded_q22);
     const int32_t reference_q22 = ramp_step(before_q22, target_q22, parameters->speed_ramp_q22);
     deferred->speed_reference_q22 = reference_q22;
-    const int32_t error_q22 = fixed_subtract(reference_q22, input->speed_q22);
+    const int32_t error_q22 =
+        fixed_subtract(fixed_add(reference_q22, course_q22(parameters, deferred, input)), input->speed_q22);
     switch (parameters->speed_law) {
     case SPEED_LAW_SMC:
         return speed_smc_reaching_torque_q24(&deferred->speed_smc, error_q22);

@@ -4,6 +4,7 @@
 
 #define ONE_Q14 (1 << 14)
 #define ONE_Q15 (1 << 15)
+#define ONE_Q16 (1 << 16)
 #define ONE_Q22 (1 << 22)
 #define ONE_Q30 (1 << 30)
 

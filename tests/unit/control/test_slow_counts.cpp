@@ -25,13 +25,15 @@ struct SlowCounts : testing::Test {
     slow_counts_t counts = {};
     slow_counts_results_t results = {};
 
-    bool step(uint32_t angle, uint32_t periods) {
-        results.slow = slow_counts_step(&parameters, &counts, angle, periods);
+    // estimate: the angle of the prediction; without one it stays in the count.
+    bool step(uint32_t angle, uint32_t periods, uint32_t estimate, double slope_Nm_rad = 0.0) {
+        results.slow = slow_counts_step(&parameters, &counts, angle, estimate, periods);
         if (results.slow) {
-            slow_counts_set(&parameters, &counts, &results);
+            slow_counts_set(&parameters, &counts, to_fixed(slope_Nm_rad / 50.0, Q24), &results);
         }
         return results.slow;
     }
+    bool step(uint32_t angle, uint32_t periods) { return step(angle, periods, angle); }
     bool wait(uint32_t periods, uint32_t angle = 0) {
         bool slow = false;
         for (uint32_t k = 0; k < periods; k++) {
@@ -98,6 +100,46 @@ TEST_F(SlowCounts, tell_the_edge_when_they_change_and_an_interval_when_not) {
     EXPECT_EQ(slow_counts_gains(&parameters, &results, 6 * COUNT), &results.edge);
 }
 
+TEST_F(SlowCounts, have_the_gains_of_the_time_when_the_prediction_left_the_count) {
+    wait(400);
+    EXPECT_EQ(slow_counts_gains(&parameters, &results, 0), &results.edge) << "later than 4 ms";
+    const double at_edge = speed_gain(results.edge), load_at_edge = load_gain(results.edge);
+    for (int k = 0; k < 300; k++) {
+        step(0, 1, k % 2 == 0 ? COUNT : COUNT + 10000);
+    }
+    EXPECT_EQ(speed_gain(results.edge), at_edge) << "the lateness does not make it smaller";
+    EXPECT_EQ(load_gain(results.edge), load_at_edge);
+    step(0, 1, 0xFFFFFFFF);
+    EXPECT_EQ(speed_gain(results.edge), at_edge) << "backwards";
+    step(0, 1, COUNT - 1);
+    EXPECT_NEAR(speed_gain(results.edge) * 703, at_edge * 401, 0.01 * at_edge * 401) << "back in the count";
+}
+
+// The exact means of sqrt(u) coth(sqrt(u)) and sqrt(u) coth(sqrt(u) / 2).
+TEST_F(SlowCounts, have_the_speed_gain_of_a_torque_that_changes_with_the_angle) {
+    const auto factor = [](double u) {
+        const double r = std::sqrt(std::fabs(u));
+        const double speed = u < 0 ? r / std::tan(r) : r / std::tanh(r);
+        const double load = u < 0 ? r / std::tan(r / 2) : r / std::tanh(r / 2);
+        return (speed + load) / 2.0 / 1.5;
+    };
+    wait(799); // the next is 20 ms after the edge
+    const double without = speed_gain(results.edge), load = load_gain(results.edge);
+    for (const double u : {-2.2, -1.0, -0.1, 0.1, 1.0, 4.0, 10.0, 20.0, 35.0}) {
+        const double slope = u * INERTIA / (0.02 * 0.02);
+        slow_counts_set(&parameters, &counts, to_fixed(slope / 50.0, Q24), &results);
+        EXPECT_NEAR(speed_gain(results.edge) / without, factor(u), (u < -2.0 ? 0.1 : 0.06) * factor(u)) << u;
+        EXPECT_EQ(load_gain(results.edge), load) << u;
+    }
+    for (const double u : {-3.0, -100.0}) {
+        slow_counts_set(&parameters, &counts, to_fixed(u * INERTIA / 0.0004 / 50.0, Q24), &results);
+        EXPECT_NEAR(speed_gain(results.edge) / without, 0.62, 0.02) << "limited";
+    }
+    slow_counts_set(&parameters, &counts, INT32_MAX, &results);
+    EXPECT_NEAR(speed_gain(results.edge) / without, 3.78, 0.1) << "limited";
+    EXPECT_EQ(load_gain(results.edge), load);
+}
+
 // A rotor at constant speed and torque: the middle of a count would leave the estimates swinging by 0.3 rad/s.
 TEST_F(SlowCounts, leave_a_rotor_at_constant_speed_no_error) {
     const load_observer_model_t model = load_observer_model(RATE_HZ, INERTIA_Q30, 0);
@@ -114,7 +156,7 @@ TEST_F(SlowCounts, leave_a_rotor_at_constant_speed_no_error) {
         const load_observer_gains_t *gains = slow_counts_gains(&parameters, &results, angle);
         load_observer_step(&model, results.slow ? gains : &parameters.deadbeat, &inertia, &observer,
                            load_observer_innovation(&observer, measured), to_fixed(load, Q24));
-        step(angle, 1);
+        step(angle, 1, uint32_t(observer.angle_q64 >> 32));
         if (k > RATE_HZ / 2) {
             error = std::fmax(error, std::fabs(observer.speed_q22 / Q22 - speed));
             load_error = std::fmax(load_error, std::fabs(observer.load_torque_q24 / Q24 - load));
