@@ -72,6 +72,18 @@ int32_t misalignment_slope_q24(const misalignment_t *misalignment) {
     return sum_q24;
 }
 
+static int32_t slope_at_q24(const misalignment_parameters_t *parameters, const machine_tables_t *tables, uint32_t angle,
+                            int32_t current_q9) {
+    return current_q9 > 0 ? phase_map_torque_slope_q24(tables, angle, current_q9, 2 * parameters->probe_angle) : 0;
+}
+
+void misalignment_follow_slope(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                               const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
+    const unsigned index = misalignment->phase_index;
+    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
+    misalignment->phase[index].slope_q24 = slope_at_q24(parameters, tables, angle, current_q9);
+}
+
 static int32_t limited_step_q10(int32_t step_q10) {
     return fixed_clamp(step_q10, -STEP_MAX_Q10, STEP_MAX_Q10);
 }
@@ -128,9 +140,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
     misalignment->disturbance_sum_q24 += disturbance_q24;
     const int64_t sum_before_q24 = phase->last_sum_q24;
     phase->last_sum_q24 = misalignment->disturbance_sum_q24;
-    const int32_t current_q9 = sample->current_q9;
-    const int32_t slope_q24 =
-        current_q9 > 0 ? phase_map_torque_slope_q24(tables, sample->angle, current_q9, 2 * parameters->probe_angle) : 0;
+    const int32_t slope_q24 = slope_at_q24(parameters, tables, sample->angle, sample->current_q9);
     phase->slope_q24 = slope_q24;
     const int32_t filter_q16 = fixed_clamp(
         fixed_multiply_high((int32_t)(sample->bandwidth_rad_s << 16), parameters->filter_q32), 0, FILTER_GAIN_MAX_Q16);

@@ -121,6 +121,11 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
  * Q9.22) of the load observer. */
 int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22);
 
+/* Instead of misalignment_step(), where nothing is learned: the slope of the phase to update, at its angle (2^-32
+ * electrical rev) and current (A, Q7.9). */
+void misalignment_follow_slope(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                               const machine_tables_t *tables, uint32_t angle, int32_t current_q9);
+
 /* Sum of the phases' slopes at their last updates, N m per 0.02 rad, Q7.24, saturates. */
 int32_t misalignment_slope_q24(const misalignment_t *misalignment);
 

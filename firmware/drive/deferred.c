@@ -60,8 +60,6 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
                                  deferred_input_t *input) {
     input->load_torque_q24 = state->observer.load_torque_q24;
     input->speed_correction_q22 = state->observer.speed_correction_q22;
-    input->electrical = measured->commutation.electrical;
-    input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
     input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
 }
@@ -83,6 +81,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->speed_q22 = state->observer.speed_q22;
     input->run = run;
     input->torque_reference_q24 = state->torque_reference_q24;
+    input->electrical = measured->commutation.electrical;
+    input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
     if (parameters->bandwidth.adaptive) {
         hand_over_bandwidth(state, measured, input);
     }
@@ -141,6 +141,14 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
     observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld, limits);
 }
 
+static void follow_slope(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
+    const commutation_t commutation = {.electrical = input->electrical};
+    const uint32_t angle =
+        commutation_angle(&parameters->commutation, &commutation, deferred->misalignment.phase_index);
+    misalignment_follow_slope(&parameters->misalignment, &deferred->misalignment, &machine_tables, angle,
+                              input->current_q9);
+}
+
 /* Between slow counts there is nothing of which statistics could be made. */
 NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                         const deferred_input_t *input, deferred_results_t *results) {
@@ -149,6 +157,9 @@ NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, 
     if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle,
                           input->periods)) {
         return false;
+    }
+    if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
+        follow_slope(parameters, deferred, input);
     }
     slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, misalignment_slope_q24(&deferred->misalignment),
                     &results->slow_counts);
@@ -163,7 +174,7 @@ static void follow_innovation(const control_parameters_t *parameters, deferred_t
     results->slow_counts.slow = false;
     if (deferred->slow_counts.slow) {
         results->slow_counts.slow = follow_slow_counts(parameters, deferred, input, results);
-    } else {
+    } else if (parameters->bandwidth.adaptive) {
         limit_bandwidth(parameters, deferred, input, &results->bandwidth);
     }
 }
@@ -331,7 +342,7 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
 /* periods: since the previous call. */
 NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                        const deferred_input_t *input, uint32_t periods) {
-    if (parameters->bandwidth.adaptive && !deferred->slow_counts.slow) {
+    if (!deferred->slow_counts.slow) {
         slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle, periods);
     }
 }
@@ -399,9 +410,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
     speed_control_deferred(parameters, deferred, input, command, state->torque_limit_q24, results);
-    if (parameters->bandwidth.adaptive) {
-        follow_innovation(parameters, deferred, input, results);
-    }
+    follow_innovation(parameters, deferred, input, results);
     deferred->run = input->run;
     if (!input->run) {
         deferred->updates_since_near = 0;

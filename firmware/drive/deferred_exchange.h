@@ -39,11 +39,11 @@ typedef struct {
     observer_bandwidth_sample_t bandwidth;
     bool run;                     /* state RUN */
     int32_t torque_reference_q24; /* of this period, N m, Q7.24; 0 outside RUN */
+    uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
+    int32_t current_q9;           /* of the phase misalignment_t.phase_index, A, Q7.9 */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
-    uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
-    int32_t current_q9;           /* of the phase to learn, misalignment_t.phase_index, A, Q7.9 */
     int32_t torque_sum_q24;       /* of the sample, N m, Q7.24 */
     int32_t torque_shortfall_q24;
 } deferred_input_t;
@@ -72,9 +72,9 @@ typedef struct {
     deferred_speed_results_t speed;
     observer_bandwidth_limits_t bandwidth; /* of the trigger */
     deferred_predictive_results_t predictive;
-    load_observer_inertia_t observer;  /* identified, inertia.h */
-    slow_counts_results_t slow_counts; /* with an adaptive bandwidth only */
-    ditc_hysteresis_limit_t limit;     /* without predictive torque control only */
+    load_observer_inertia_t observer; /* identified, inertia.h */
+    slow_counts_results_t slow_counts;
+    ditc_hysteresis_limit_t limit; /* without predictive torque control only */
 } deferred_results_t;
 
 typedef struct {

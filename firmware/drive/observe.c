@@ -50,7 +50,7 @@ void observe(const control_parameters_t *parameters, control_state_t *state, con
              const control_measurement_t *measured) {
     const int32_t innovation = load_observer_innovation(&state->observer, measured->angle);
     const load_observer_gains_t *gains =
-        parameters->bandwidth.adaptive && deferred->slow_counts.slow
+        deferred->slow_counts.slow
             ? slow_gains(parameters, state, &deferred->slow_counts, measured)
             : observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
                                       &measured->angle_from_edge);
