@@ -67,10 +67,12 @@ static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t pe
 }
 
 NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts,
-                               uint32_t encoder_angle, uint32_t angle, uint32_t periods) {
+                               uint32_t encoder_angle, uint32_t rotation, uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
     counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
-    counts->interval = angle - encoder_angle < parameters->count ? counts->periods : counts->interval;
+    if ((uint64_t)counts->periods * rotation < parameters->count) {
+        counts->interval = counts->periods;
+    }
     const bool long_since = passed >= parameters->slow_periods;
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;

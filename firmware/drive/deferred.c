@@ -154,8 +154,8 @@ NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, 
                                         const deferred_input_t *input, deferred_results_t *results) {
     results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
                                                        parameters->bandwidth.trigger_stage_count};
-    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle,
-                          input->periods)) {
+    if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
+                          fixed_magnitude(rotation(parameters, input)), input->periods)) {
         return false;
     }
     if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
@@ -343,7 +343,8 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
 NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                        const deferred_input_t *input, uint32_t periods) {
     if (!deferred->slow_counts.slow) {
-        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle, input->angle, periods);
+        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
+                         fixed_magnitude(rotation(parameters, input)), periods);
     }
 }
 
