@@ -20,6 +20,9 @@
 #define U_MAX_Q8 (36 << 8)
 #define Z_MAX_Q8 (1u << 15)
 
+/* Two counts, of a quarter each 4 ms, Q8. */
+#define UNCERTAIN_MAX_Q8 (8u << 8)
+
 slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigned encoder_bits, int32_t inertia_q30) {
     const int64_t slope_gain_q46 = (SLOPES_PER_RAD << 46) / (DEADBEAT_HZ * DEADBEAT_HZ);
     const uint32_t deadbeat_periods = control_rate_hz / DEADBEAT_HZ; /* below 2^13 */
@@ -76,6 +79,7 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
     const bool long_since = passed >= parameters->slow_periods;
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;
+        counts->apart = passed < PERIODS_MAX ? passed : PERIODS_MAX;
         counts->periods = counts->interval = 0;
         counts->slow = long_since;
     } else if (long_since) {
@@ -95,6 +99,12 @@ NOINLINE void slow_counts_set(const slow_counts_parameters_t *parameters, const 
     } else {
         set_deadbeat(parameters, coming, slope_q24, &results->edge);
     }
+}
+
+uint32_t slow_counts_uncertain_angle(const slow_counts_parameters_t *parameters, const slow_counts_t *counts) {
+    const uint32_t apart = counts->apart > counts->interval ? counts->apart : counts->interval;
+    const uint32_t ratio_q8 = (apart << 8) / parameters->deadbeat_periods;
+    return (parameters->count >> 10) * (ratio_q8 < UNCERTAIN_MAX_Q8 ? ratio_q8 : UNCERTAIN_MAX_Q8);
 }
 
 NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const load_observer_t *observer,

@@ -51,7 +51,8 @@ typedef struct {
 typedef struct {
     uint32_t encoder_angle; /* start of the count, 2^-32 rev */
     uint32_t periods;       /* since it changed, saturates at 2^20 */
-    uint32_t interval;      /* until the prediction left it */
+    uint32_t interval;      /* in which the estimated speed passes a count, or since then */
+    uint32_t apart;         /* periods between the last two changes */
     bool slow;
 } slow_counts_t;
 
@@ -74,6 +75,10 @@ bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t 
  * divisions when no count changed for 4 ms. */
 void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts, int32_t slope_q24,
                      slow_counts_results_t *results);
+
+/* Angle by which the estimate may err between the counts: a quarter of a count for each 4 ms that they are apart, at
+ * most two counts; 2^-32 rev. */
+uint32_t slow_counts_uncertain_angle(const slow_counts_parameters_t *parameters, const slow_counts_t *counts);
 
 /* Angle of a sample with slow counts: the edge where the count has changed, else what in the count is nearest to the
  * prediction. All in 2^-32 rev. */

@@ -208,6 +208,18 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
                                         input->speed_correction_q22);
 }
 
+/* Between slow counts the flux linkage is compared at an angle of the model. */
+static int32_t told_by_flux(const control_parameters_t *parameters, const deferred_t *deferred, int32_t misalignment) {
+    if (!deferred->slow_counts.slow || misalignment == 0) {
+        return misalignment;
+    }
+    const int32_t offset = deferred->misalignment.phase[deferred->misalignment.phase_index].offset;
+    const int32_t uncertain = (int32_t)(slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts) *
+                                        parameters->commutation.rotor_poles);
+    const int32_t error = fixed_subtract(misalignment, offset);
+    return fixed_abs(error) > uncertain ? fixed_subtract(misalignment, error > 0 ? uncertain : -uncertain) : 0;
+}
+
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     const commutation_t commutation = {.electrical = input->electrical};
@@ -222,7 +234,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
         .condition = condition(deferred, undisturbed_speed_control(parameters, deferred, input)),
-        .flux_misalignment = flux_misalignment[phase],
+        .flux_misalignment = told_by_flux(parameters, deferred, flux_misalignment[phase]),
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
