@@ -13,6 +13,7 @@ from dataclasses import replace
 from salient.bench.emulator import EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.config import BenchConfig
+from salient.machine.lowest_speed import lowest_speed_rpm
 
 TELEMETRY_PERIOD_MS = 1
 """Of a bench, unless its configuration states one; a bus with one drive alone has room for it."""
@@ -37,6 +38,8 @@ class Bench(Session):
             super().__init__(can, parameter_table=lambda: parameter_table(config),
                              is_alive=lambda: self.simulator.is_alive, machine=config.machine, node=config.node,
                              drives=config.drives)
+            for drive in self.drives:
+                drive.lowest_speed_rpm = lowest_speed_rpm(config.machine, config.encoder_bits, config.controller)
         except BaseException:
             self.simulator.close()
             raise

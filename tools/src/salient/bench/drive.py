@@ -89,6 +89,9 @@ class Drive(KnownAttributes):
     """
 
     command_due_ns: int | None
+    lowest_speed_rpm: float
+    """Below it a speed reference other than 0 is refused (salient.machine.lowest_speed); 0 of a drive whose encoder is
+    not known here."""
     parameters: Parameters
     fault_log: FaultLog
 
@@ -105,6 +108,7 @@ class Drive(KnownAttributes):
         self._arming_counter = 0
         self._disarmed_ns: int | None = None
         self.command_due_ns = None
+        self.lowest_speed_rpm = 0.0
         self.parameters = Parameters(session, parameter_table)
         self.fault_log = FaultLog(session)
 
@@ -116,12 +120,17 @@ class Drive(KnownAttributes):
     @property
     def speed_reference_rpm(self) -> float:
         """Last requested value, in the range of the drive's DBC, which is that of the machine; negative is reverse, and
-        0 to a controller that drives forward only. The drive limits it to 7/8 of over_speed_rpm."""
+        0 to a controller that drives forward only. DriveError out of that range, and below lowest_speed_rpm but for 0.
+        The drive limits it to 7/8 of over_speed_rpm."""
         return self._speed_reference_rpm
 
     @speed_reference_rpm.setter
     def speed_reference_rpm(self, value: float) -> None:
-        self._speed_reference_rpm = _checked(self._command, "speed_reference_rpm", value)
+        checked = _checked(self._command, "speed_reference_rpm", value)
+        if 0.0 < abs(checked) < self.lowest_speed_rpm:
+            raise DriveError(f"speed_reference_rpm {value:g}: the drive's encoder allows 0, or from "
+                             f"{self.lowest_speed_rpm:.2f} r/min on")
+        self._speed_reference_rpm = checked
         self._torque_mode = False
         self.ask("run")
 
