@@ -77,19 +77,29 @@ static int32_t slope_at_q24(const misalignment_parameters_t *parameters, const m
     return current_q9 > 0 ? phase_map_torque_slope_q24(tables, angle, current_q9, 2 * parameters->probe_angle) : 0;
 }
 
-void misalignment_follow_slope(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                               const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
-    const unsigned index = misalignment->phase_index;
-    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
-    misalignment->phase[index].slope_q24 = slope_at_q24(parameters, tables, angle, current_q9);
-}
-
 static int32_t limited_step_q10(int32_t step_q10) {
     return fixed_clamp(step_q10, -STEP_MAX_Q10, STEP_MAX_Q10);
 }
 
 static int64_t clamped_offset_q40(int64_t offset_q40) {
     return fixed_clamp_64(offset_q40, -OFFSET_LIMIT_Q40, OFFSET_LIMIT_Q40);
+}
+
+/* Step of a phase towards the angle that its flux linkage shows, which the end of a stroke does not undo. */
+static inline int64_t flux_step_q40(const misalignment_parameters_t *parameters, misalignment_phase_t *phase,
+                                    int32_t flux_error) {
+    const int64_t step_q40 = fixed_product(flux_error, parameters->flux_rate_q8) >> 8;
+    phase->before_last_q40 += step_q40;
+    phase->before_q40 += step_q40;
+    return step_q40;
+}
+
+static inline void add_to_offset(const misalignment_parameters_t *parameters, misalignment_phase_t *phase,
+                                 int64_t step_q40) {
+    phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
+    /* 0.02 rad is twice the probe angle. */
+    phase->offset =
+        fixed_multiply_shift((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
 }
 
 /* Gain of means over the time since the state became steady, at most 100 ms: before, the load was another. */
@@ -167,14 +177,23 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
         const int32_t step_q10 = phase_step_q10(misalignment, error_q24, alternating_q24, sample->torque_q24);
         step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
     } else {
-        step_q40 = fixed_product(flux_error, parameters->flux_rate_q8) >> 8;
-        phase->before_last_q40 += step_q40;
-        phase->before_q40 += step_q40;
+        step_q40 = flux_step_q40(parameters, phase, flux_error);
     }
-    phase->offset_q40 = clamped_offset_q40(phase->offset_q40 + step_q40);
-    /* 0.02 rad is twice the probe angle. */
-    phase->offset =
-        fixed_multiply_shift((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
+    add_to_offset(parameters, phase, step_q40);
+}
+
+void misalignment_follow_flux(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              const machine_tables_t *tables, uint32_t angle, int32_t current_q9,
+                              int32_t flux_misalignment) {
+    const unsigned index = misalignment->phase_index;
+    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
+    misalignment->steady_updates = 0;
+    misalignment->learning = false;
+    misalignment_phase_t *phase = &misalignment->phase[index];
+    IN_REGISTER(phase);
+    phase->slope_q24 = slope_at_q24(parameters, tables, angle, current_q9);
+    const int32_t error = flux_misalignment != 0 ? fixed_subtract(flux_misalignment, phase->offset) : 0;
+    add_to_offset(parameters, phase, flux_step_q40(parameters, phase, error));
 }
 
 /* Part of a value around the frequency of the strokes. */

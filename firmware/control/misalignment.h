@@ -121,10 +121,12 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
  * Q9.22) of the load observer. */
 int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22);
 
-/* Instead of misalignment_step(), where nothing is learned: the slope of the phase to update, at its angle (2^-32
- * electrical rev) and current (A, Q7.9). */
-void misalignment_follow_slope(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                               const machine_tables_t *tables, uint32_t angle, int32_t current_q9);
+/* Instead of misalignment_step(), where the ripple teaches nothing: updates one phase by its flux linkage alone
+ * (flux_misalignment: of misalignment_sample_t), and its slope, at its corrected angle (2^-32 electrical rev) and
+ * current (A, Q7.9). */
+void misalignment_follow_flux(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                              const machine_tables_t *tables, uint32_t angle, int32_t current_q9,
+                              int32_t flux_misalignment);
 
 /* Sum of the phases' slopes at their last updates, N m per 0.02 rad, Q7.24, saturates. */
 int32_t misalignment_slope_q24(const misalignment_t *misalignment);

@@ -88,16 +88,14 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
     return counts->slow;
 }
 
-NOINLINE void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts,
-                              int32_t slope_q24, slow_counts_results_t *results) {
+NOINLINE void slow_counts_update(const slow_counts_parameters_t *parameters, slow_counts_t *counts, int32_t slope_q24) {
     const uint32_t coming = counts->interval + 1u;
-    results->encoder_angle = counts->encoder_angle;
-    results->late = coming > parameters->deadbeat_periods;
-    results->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
-    if (!results->late) {
-        set_narrow(parameters, coming, &results->edge);
+    counts->late = coming > parameters->deadbeat_periods;
+    counts->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
+    if (!counts->late) {
+        set_narrow(parameters, coming, &counts->edge);
     } else {
-        set_deadbeat(parameters, coming, slope_q24, &results->edge);
+        set_deadbeat(parameters, coming, slope_q24, &counts->edge);
     }
 }
 

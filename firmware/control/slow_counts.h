@@ -54,14 +54,16 @@ typedef struct {
     uint32_t interval;      /* in which the estimated speed passes a count, or since then */
     uint32_t apart;         /* periods between the last two changes */
     bool slow;
+    bool late;                  /* the interval is longer than 4 ms */
+    load_observer_gains_t edge; /* when the count changes, and when the prediction leaves it late */
 } slow_counts_t;
 
 /* What the coming sample needs; the rest has a meaning while counts are slow. */
 typedef struct {
     bool slow;
-    uint32_t encoder_angle;     /* of the last sample */
-    bool late;                  /* that is later than 4 ms after the last edge */
-    load_observer_gains_t edge; /* when it changes, and when the prediction leaves it late */
+    bool late;
+    uint32_t encoder_angle; /* of the last sample */
+    load_observer_gains_t edge;
 } slow_counts_results_t;
 
 slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigned encoder_bits, int32_t inertia_q30);
@@ -71,10 +73,16 @@ slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigne
 bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts, uint32_t encoder_angle,
                       uint32_t angle, uint32_t periods);
 
-/* All results but `slow`. slope_q24: K in N m per 0.02 rad, Q7.24. Products of 64 bits, rounded down; three 32-bit
- * divisions when no count changed for 4 ms. */
-void slow_counts_set(const slow_counts_parameters_t *parameters, const slow_counts_t *counts, int32_t slope_q24,
-                     slow_counts_results_t *results);
+/* Gains of the coming samples, while counts are slow. slope_q24: K in N m per 0.02 rad, Q7.24. Products of 64 bits,
+ * rounded down; three 32-bit divisions when no count changed for 4 ms. */
+void slow_counts_update(const slow_counts_parameters_t *parameters, slow_counts_t *counts, int32_t slope_q24);
+
+/* All results but `slow`. */
+static inline void slow_counts_set(const slow_counts_t *counts, slow_counts_results_t *results) {
+    results->late = counts->late;
+    results->encoder_angle = counts->encoder_angle;
+    results->edge = counts->edge;
+}
 
 /* Angle by which the estimate may err between the counts: a quarter of a count for each 4 ms that they are apart, at
  * most two counts; 2^-32 rev. */

@@ -141,14 +141,6 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
     observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld, limits);
 }
 
-static void follow_slope(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
-    const commutation_t commutation = {.electrical = input->electrical};
-    const uint32_t angle =
-        commutation_angle(&parameters->commutation, &commutation, deferred->misalignment.phase_index);
-    misalignment_follow_slope(&parameters->misalignment, &deferred->misalignment, &machine_tables, angle,
-                              input->current_q9);
-}
-
 /* Between slow counts there is nothing of which statistics could be made. */
 NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                         const deferred_input_t *input, deferred_results_t *results) {
@@ -158,11 +150,7 @@ NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, 
                           fixed_magnitude(rotation(parameters, input)), input->periods)) {
         return false;
     }
-    if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
-        follow_slope(parameters, deferred, input);
-    }
-    slow_counts_set(&parameters->slow_counts, &deferred->slow_counts, misalignment_slope_q24(&deferred->misalignment),
-                    &results->slow_counts);
+    slow_counts_set(&deferred->slow_counts, &results->slow_counts);
     if (deferred->mode == DRIVE_MODE_SPEED) {
         speed_control_limit_uncertain(parameters, input->load_torque_q24, &results->speed);
     }
@@ -199,7 +187,7 @@ static misalignment_condition_t condition(const deferred_t *deferred, bool undis
     if (deferred->mode != DRIVE_MODE_SPEED || !deferred->load_constant) {
         return MISALIGNMENT_UNSTEADY;
     }
-    const bool steady = undisturbed && !deferred->slow_counts.slow && stroke_mean_shows_load(&deferred->stroke_mean);
+    const bool steady = undisturbed && stroke_mean_shows_load(&deferred->stroke_mean);
     return steady ? MISALIGNMENT_STEADY : MISALIGNMENT_INTERRUPTED;
 }
 
@@ -210,14 +198,27 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
 
 /* Between slow counts the flux linkage is compared at an angle of the model. */
 static int32_t told_by_flux(const control_parameters_t *parameters, const deferred_t *deferred, int32_t misalignment) {
-    if (!deferred->slow_counts.slow || misalignment == 0) {
-        return misalignment;
-    }
     const int32_t offset = deferred->misalignment.phase[deferred->misalignment.phase_index].offset;
     const int32_t uncertain = (int32_t)(slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts) *
                                         parameters->commutation.rotor_poles);
     const int32_t error = fixed_subtract(misalignment, offset);
-    return fixed_abs(error) > uncertain ? fixed_subtract(misalignment, error > 0 ? uncertain : -uncertain) : 0;
+    return misalignment != 0 && fixed_abs(error) > uncertain
+               ? fixed_subtract(misalignment, error > 0 ? uncertain : -uncertain)
+               : 0;
+}
+
+/* While counts are slow the ripple teaches nothing; the gains of the coming counts by the slope of the torque. */
+NOINLINE static void learn_between_counts(const control_parameters_t *parameters, deferred_t *deferred,
+                                          const deferred_input_t *input,
+                                          const int32_t flux_misalignment[HAL_PHASES_MAX]) {
+    const commutation_t commutation = {.electrical = input->electrical};
+    const unsigned phase = deferred->misalignment.phase_index;
+    const uint32_t angle = commutation_angle(&parameters->commutation, &commutation, phase) -
+                           (uint32_t)deferred->misalignment.phase[phase].offset;
+    misalignment_follow_flux(&parameters->misalignment, &deferred->misalignment, &machine_tables, angle,
+                             input->current_q9, told_by_flux(parameters, deferred, flux_misalignment[phase]));
+    slow_counts_update(&parameters->slow_counts, &deferred->slow_counts,
+                       misalignment_slope_q24(&deferred->misalignment));
 }
 
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
@@ -234,7 +235,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
         .torque_q24 = input->torque_reference_q24,
         .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
         .condition = condition(deferred, undisturbed_speed_control(parameters, deferred, input)),
-        .flux_misalignment = told_by_flux(parameters, deferred, flux_misalignment[phase]),
+        .flux_misalignment = flux_misalignment[phase],
     };
     misalignment_step(&parameters->misalignment, &deferred->misalignment, &machine_tables, &sample);
 }
@@ -405,6 +406,10 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         break;
     default:
         average_torque(deferred, input->torque_sum_q24);
+        if (deferred->slow_counts.slow) {
+            learn_between_counts(parameters, deferred, input, flux_misalignment);
+            break;
+        }
         learn_misalignment(parameters, deferred, input, flux_misalignment);
         await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
         break;
@@ -430,8 +435,12 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         deferred->mean_torque_q24 = 0;
         inertia_restart(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical);
         await_slow_counts(parameters, deferred, input, input->periods);
+        slow_counts_update(&parameters->slow_counts, &deferred->slow_counts, 0);
         limit_currents(parameters, input, reset, results);
     } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
+        if (deferred->slow_counts.slow) {
+            learn_between_counts(parameters, deferred, input, state->flux_misalignment);
+        }
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);
     } else if (!reset) { /* a step that resets has done enough */

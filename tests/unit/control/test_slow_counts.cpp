@@ -25,15 +25,17 @@ struct SlowCounts : testing::Test {
     slow_counts_t counts = {};
     slow_counts_results_t results = {};
 
-    // estimate: the angle of the prediction; without one it stays in the count.
-    bool step(uint32_t angle, uint32_t periods, uint32_t estimate, double slope_Nm_rad = 0.0) {
-        results.slow = slow_counts_step(&parameters, &counts, angle, estimate, periods);
+    bool step(uint32_t angle, uint32_t periods, uint32_t rotation = 0) {
+        results.slow = slow_counts_step(&parameters, &counts, angle, rotation, periods);
         if (results.slow) {
-            slow_counts_set(&parameters, &counts, to_fixed(slope_Nm_rad / 50.0, Q24), &results);
+            set(0);
         }
         return results.slow;
     }
-    bool step(uint32_t angle, uint32_t periods) { return step(angle, periods, angle); }
+    void set(int32_t slope_q24) {
+        slow_counts_update(&parameters, &counts, slope_q24);
+        slow_counts_set(&counts, &results);
+    }
     bool wait(uint32_t periods, uint32_t angle = 0) {
         bool slow = false;
         for (uint32_t k = 0; k < periods; k++) {
@@ -100,19 +102,28 @@ TEST_F(SlowCounts, tell_the_edge_when_they_change_and_an_interval_when_not) {
     EXPECT_EQ(slow_counts_gains(&parameters, &results, 6 * COUNT), &results.edge);
 }
 
-TEST_F(SlowCounts, have_the_gains_of_the_time_when_the_prediction_left_the_count) {
+TEST_F(SlowCounts, have_the_gains_of_the_time_in_which_the_estimated_speed_passes_a_count) {
     wait(400);
     EXPECT_EQ(slow_counts_gains(&parameters, &results, 0), &results.edge) << "later than 4 ms";
-    const double at_edge = speed_gain(results.edge), load_at_edge = load_gain(results.edge);
+    const double speed = speed_gain(results.edge), load = load_gain(results.edge);
     for (int k = 0; k < 300; k++) {
-        step(0, 1, k % 2 == 0 ? COUNT : COUNT + 10000);
+        step(0, 1, COUNT / 400);
     }
-    EXPECT_EQ(speed_gain(results.edge), at_edge) << "the lateness does not make it smaller";
-    EXPECT_EQ(load_gain(results.edge), load_at_edge);
-    step(0, 1, 0xFFFFFFFF);
-    EXPECT_EQ(speed_gain(results.edge), at_edge) << "backwards";
-    step(0, 1, COUNT - 1);
-    EXPECT_NEAR(speed_gain(results.edge) * 703, at_edge * 401, 0.01 * at_edge * 401) << "back in the count";
+    EXPECT_EQ(speed_gain(results.edge), speed) << "the lateness does not make it smaller";
+    EXPECT_EQ(load_gain(results.edge), load);
+    step(0, 1, COUNT / 800);
+    EXPECT_NEAR(speed_gain(results.edge) * 702, speed * 401, 0.01 * speed * 401) << "a slower one";
+}
+
+TEST_F(SlowCounts, leave_an_angle_uncertain_by_a_quarter_of_a_count_for_each_4_ms) {
+    wait(80);
+    EXPECT_NEAR(slow_counts_uncertain_angle(&parameters, &counts), COUNT / 8, COUNT / 500);
+    wait(400);
+    step(COUNT, 1);
+    EXPECT_NEAR(slow_counts_uncertain_angle(&parameters, &counts), 481.0 / 640.0 * COUNT, COUNT / 500)
+        << "of the time between the last edges";
+    wait(40000, COUNT);
+    EXPECT_EQ(slow_counts_uncertain_angle(&parameters, &counts), 2 * COUNT) << "limited";
 }
 
 // The exact means of sqrt(u) coth(sqrt(u)) and sqrt(u) coth(sqrt(u) / 2).
@@ -127,15 +138,15 @@ TEST_F(SlowCounts, have_the_speed_gain_of_a_torque_that_changes_with_the_angle) 
     const double without = speed_gain(results.edge), load = load_gain(results.edge);
     for (const double u : {-2.2, -1.0, -0.1, 0.1, 1.0, 4.0, 10.0, 20.0, 35.0}) {
         const double slope = u * INERTIA / (0.02 * 0.02);
-        slow_counts_set(&parameters, &counts, to_fixed(slope / 50.0, Q24), &results);
+        set(to_fixed(slope / 50.0, Q24));
         EXPECT_NEAR(speed_gain(results.edge) / without, factor(u), (u < -2.0 ? 0.1 : 0.06) * factor(u)) << u;
         EXPECT_EQ(load_gain(results.edge), load) << u;
     }
     for (const double u : {-3.0, -100.0}) {
-        slow_counts_set(&parameters, &counts, to_fixed(u * INERTIA / 0.0004 / 50.0, Q24), &results);
+        set(to_fixed(u * INERTIA / 0.0004 / 50.0, Q24));
         EXPECT_NEAR(speed_gain(results.edge) / without, 0.62, 0.02) << "limited";
     }
-    slow_counts_set(&parameters, &counts, INT32_MAX, &results);
+    set(INT32_MAX);
     EXPECT_NEAR(speed_gain(results.edge) / without, 3.78, 0.1) << "limited";
     EXPECT_EQ(load_gain(results.edge), load);
 }
@@ -156,7 +167,7 @@ TEST_F(SlowCounts, leave_a_rotor_at_constant_speed_no_error) {
         const load_observer_gains_t *gains = slow_counts_gains(&parameters, &results, angle);
         load_observer_step(&model, results.slow ? gains : &parameters.deadbeat, &inertia, &observer,
                            load_observer_innovation(&observer, measured), to_fixed(load, Q24));
-        step(angle, 1, uint32_t(observer.angle_q64 >> 32));
+        step(angle, 1, uint32_t(std::fabs(observer.speed_q22 / Q22) / RATE_HZ / (2.0 * PI) * REV));
         if (k > RATE_HZ / 2) {
             error = std::fmax(error, std::fabs(observer.speed_q22 / Q22 - speed));
             load_error = std::fmax(load_error, std::fabs(observer.load_torque_q24 / Q24 - load));

@@ -1,14 +1,16 @@
 """Lowest speed at which a drive with a coarse encoder is steady.
 
-Between two counts the rotor angle is an estimate, and the phases carry the currents of that angle. An error of it makes
-an error of the torque, K times the angle with K the sum of the slopes dT/dtheta of the phases at their currents, and
-grows where K is positive:
+Between two counts, a time t apart, the rotor angle is an estimate, and the phases carry the currents of that angle. An
+error of it makes an error of the torque, K times the angle with K the sum of the slopes dT/dtheta of the phases at
+their currents, and grows where K is positive:
 
     J d2(error)/dt2 = K error,   s = sqrt(max K / J) in 1/s
 
-A count that comes after the time t finds it exp(s t) times as large. The drive's law of slow counts
-(firmware/control/slow_counts.h) reckons with that, up to s t = 5 with `salient`, whose torque is smooth, and half of
-that with the laws of hysteresis and duty: found by trial with the bundled machines and four others, 9 to 14 bits.
+The drive's law of slow counts (firmware/control/slow_counts.h) reckons with that, up to s t = 5 with `salient`, whose
+torque is smooth, and half of that with the laws of hysteresis and duty. What the torque estimate errs by, e, changes
+with the strokes, of which there are n in a turn: from count to count by 2 pi e n / 2^bits, which moves the rotor by a
+count in t = sqrt(2 J / (n e)). That is the other bound of t, with e of a hundredth of the torque. Both constants are
+found by trial with the bundled machines and others, 9 to 14 bits.
 """
 
 from __future__ import annotations
@@ -26,11 +28,13 @@ from salient.machine.sharing_window import least_current_window_deg
 COARSE_BITS = 12
 """Encoders of more bits have no lowest speed."""
 
-GROWTH = {"salient": 5.0, "paper": 2.5, "traditional": 2.5}
-"""Largest s t by controller."""
+GROWTH_MAX = 5.0
+TORQUE_ERROR = 0.01
+HASTE = {"salient": 1.0, "paper": 2.0, "traditional": 2.0}
+"""How much closer the counts are to be, by controller."""
 
 RATED_PART = 0.5
-"""Part of the rated torque at which the slopes are taken."""
+"""Part of the rated torque for which both are taken."""
 
 _ANGLES_DEG = np.arange(180.0, 361.0)
 _CURRENTS = 160
@@ -40,33 +44,50 @@ def lowest_speed_rpm(machine: str, encoder_bits: int, controller: str) -> float:
     """Of a machine by its name or file; 0 with an encoder that is not coarse, or ideal (0 bits)."""
     if not 0 < encoder_bits <= COARSE_BITS:
         return 0.0
-    return 60.0 * _error_growth_of_name_1_s(machine) / GROWTH[controller] / 2**encoder_bits
+    return HASTE[controller] * _lowest_rpm(machine, encoder_bits)
 
 
 @lru_cache
-def _error_growth_of_name_1_s(name: str) -> float:
-    return error_growth_1_s(load_machine(machine_path(name)))
+def _lowest_rpm(name: str, encoder_bits: int) -> float:
+    machine = load_machine(machine_path(name))
+    torque_Nm = RATED_PART * derive(machine).torque_rated_Nm
+    strokes = machine.phases * machine.rotor_poles
+    drift_s = math.sqrt(2.0 * machine.inertia_kg_m2 / (strokes * TORQUE_ERROR * torque_Nm))
+    return 60.0 / 2**encoder_bits * max(error_growth_1_s(machine) / GROWTH_MAX, 1.0 / drift_s)
 
 
 def error_growth_1_s(machine: Machine) -> float:
-    """s at RATED_PART of the rated torque, shared with the least current."""
+    """s at RATED_PART of the rated torque: the larger one of the window with the least current and of the parameters',
+    where that makes the torque."""
     data = derive(machine)
     torque_Nm = RATED_PART * data.torque_rated_Nm
-    on_deg, off_deg = least_current_window_deg(machine.magnetics, machine.phases, torque_Nm, data.current_peak_A)
-    stroke_deg = 360.0 / machine.phases
+    windows_deg = (
+        least_current_window_deg(machine.magnetics, machine.phases, torque_Nm, data.current_peak_A),
+        (data.parameters["share_on_angle_deg"], data.parameters["share_off_angle_deg"]),
+    )
     angle_rad = _ANGLES_DEG / 360.0 * machine.magnetics.pitch_rad
     grid_A = np.linspace(0.0, data.current_peak_A, _CURRENTS)
     made_Nm = machine.magnetics.torque_Nm(angle_rad[:, None], grid_A[None, :])
     slope_Nm_rad = np.gradient(made_Nm, angle_rad, axis=0)
-    share_Nm = torque_Nm * _share(_ANGLES_DEG - on_deg, stroke_deg, off_deg - on_deg - stroke_deg)
-    stiffness_Nm_rad = np.zeros(len(_ANGLES_DEG))
+    most_Nm_rad = 0.0
+    for number, (on_deg, off_deg) in enumerate(windows_deg):
+        share_Nm = torque_Nm * _share(_ANGLES_DEG - on_deg, 360.0 / machine.phases,
+                                      off_deg - on_deg - 360.0 / machine.phases)
+        if number == 0 or np.all(made_Nm.max(axis=1) >= share_Nm):
+            most_Nm_rad = max(most_Nm_rad, _stiffness_Nm_rad(made_Nm, slope_Nm_rad, share_Nm, grid_A, machine.phases))
+    return math.sqrt(most_Nm_rad / machine.inertia_kg_m2)
+
+
+def _stiffness_Nm_rad(made_Nm: np.ndarray, slope_Nm_rad: np.ndarray, share_Nm: np.ndarray, grid_A: np.ndarray,
+                      phases: int) -> float:
+    """Largest sum of the phases' slopes, from torque and slope over angle and current and the torque of each angle."""
+    own_Nm_rad = np.zeros(len(_ANGLES_DEG))
     for row, share in enumerate(share_Nm):
         rising_Nm = np.maximum.accumulate(np.maximum(made_Nm[row], 0.0))
         current_A = np.interp(share, rising_Nm, grid_A) if share > 0.0 else 0.0
-        stiffness_Nm_rad[row] = np.interp(current_A, grid_A, slope_Nm_rad[row])
-    place = (_ANGLES_DEG % stroke_deg).astype(int)
-    most_Nm_rad = float(np.bincount(place, stiffness_Nm_rad).max())
-    return math.sqrt(max(most_Nm_rad, 0.0) / machine.inertia_kg_m2)
+        own_Nm_rad[row] = np.interp(current_A, grid_A, slope_Nm_rad[row])
+    place = (_ANGLES_DEG % (360.0 / phases)).astype(int)
+    return float(np.bincount(place, own_Nm_rad).max())
 
 
 def _share(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: float) -> np.ndarray:
