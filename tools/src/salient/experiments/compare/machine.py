@@ -18,6 +18,7 @@ from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
+from salient.machine.lowest_speed import lowest_speed_rpm
 from salient.machine.parameter_table import read_table
 from salient.paths import MACHINES
 
@@ -69,6 +70,12 @@ def subject(name_or_path: str) -> Subject:
     })
 
 
+def _allowed(scenario: Scenario) -> bool:
+    """False when the drive is refused a speed with the scenario's encoder."""
+    lowest_rpm = lowest_speed_rpm(scenario.machine, scenario.encoder_bits, scenario.controller)
+    return all(step.value_rpm == 0.0 or abs(step.value_rpm) >= lowest_rpm for step in scenario.speed)
+
+
 def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Case]:
     """The cases of the paper's machine among `cases`, for another machine, and its own runs of the groups `machines`
     and those of speed_range.py."""
@@ -79,7 +86,9 @@ def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Ca
         if case.group in speed_range.GROUPS:
             continue
         if case.scenario.machine == PAPER:
-            of_paper.append(_case(case, on))
+            own_case = _case(case, on)
+            if _allowed(own_case.scenario):
+                of_paper.append(own_case)
         elif case.extractor == "every_machine":
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
                 machine_path(on.path), case.controller))

@@ -110,6 +110,7 @@ METRICS = {
     "hold_percent": Metric("mean speed error", "%", 4, 0.002),
     "failed": Metric("failed drives", "", 0, 0.5),
     "against_periods": Metric("longest torque against the load", "control periods", 1, 0.5),
+    "course_counts": Metric("deviation from the ideal course", "counts", 2, 0.05),
     "ripple_3s": Metric("K_t after 3 s", "", 5, 0.0002),
     "ripple_6s": Metric("K_t after 6 s", "", 5, 0.0002),
     "ripple_3s_ratio": Metric("K_t after 3 s relative to the aligned drive", "", 2, 0.05),
@@ -207,11 +208,26 @@ def encoder_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window 
     control periods."""
     step = scenario.load[0]
     drop = metrics.speed_after_step(recording, scenario.speed[-1].value_rpm, step.at_s)["speed_dip_rpm"]
-    against = np.asarray(recording["torque_Nm"]) < -0.1 * step.torque_Nm
+    return {"against_periods": _against_periods(scenario, recording), "speed_dip_rpm": drop}
+
+
+def _against_periods(scenario: Scenario, recording: np.ndarray) -> float:
+    against = np.asarray(recording["torque_Nm"]) < -0.1 * scenario.load[0].torque_Nm
     edges = np.flatnonzero(np.diff(np.concatenate(([0], against.astype(np.int8), [0]))))
     longest = int(np.max(edges[1::2] - edges[::2], initial=0))
-    return {"against_periods": longest * metrics.sample_step_s(recording["time_s"]) * scenario.control_rate_hz,
-            "speed_dip_rpm": drop}
+    return longest * metrics.sample_step_s(recording["time_s"]) * scenario.control_rate_hz
+
+
+def encoder_course_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """Steady running with a coarse encoder: error of the mean speed, by the line of least squares through the angle;
+    the range of the angle's deviation from its ideal course, in counts; torque against the load as encoder_metrics."""
+    reference_rpm = scenario.speed[-1].value_rpm
+    time_s = np.asarray(recording["time_s"], dtype=float) - float(recording["time_s"][0])
+    deviation_deg = _travel_deg(recording) - 6.0 * reference_rpm * time_s
+    slope_deg_s = float(np.polyfit(time_s, deviation_deg, 1)[0])
+    return {"mean_error_percent": abs(100.0 * slope_deg_s / (6.0 * reference_rpm)),
+            "course_counts": float(np.ptp(deviation_deg)) * 2**scenario.encoder_bits / 360.0,
+            "against_periods": _against_periods(scenario, recording)}
 
 
 def ripple_3s_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -314,6 +330,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "speed_ramps": speed_ramps_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "encoder": encoder_metrics,
+    "encoder_course": encoder_course_metrics,
     "ripple_3s": ripple_3s_metrics,
     "ripple_6s": ripple_6s_metrics,
     "inertia_step": inertia_step_metrics,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from salient.config import CONTROLLERS
 from salient.experiments.compare.case import (
     LOAD_NM,
     MACHINES,
@@ -16,6 +17,7 @@ from salient.experiments.compare.case import (
 )
 from salient.experiments.metrics import stroke_deg
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
+from salient.machine.lowest_speed import COARSE_BITS, lowest_speed_rpm
 
 SALIENT = ("salient",)
 TWO_MACHINES = ("saturating", "finite_element")
@@ -23,6 +25,10 @@ TWO_MACHINES = ("saturating", "finite_element")
 ENCODER_BITS = (8, 10, 12, 14, 17, 20)
 ENCODER_SPEEDS_RPM = (5.0, 10.0, 30.0, 150.0, 600.0, 1500.0)
 ENCODER_ANGLES = {"saturating": 24, "finite_element": 6}
+
+COURSE_BITS = (9, 10, 11, 12)
+COURSE_SPEEDS_RPM = (0.5, 1.0, 2.0, 5.0, 10.0, 60.0)
+COURSE_SETTLING_S, COURSE_COUNTS = 2.0, 40.0
 
 OFFSETS_DEG = (0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 OFFSET_SPEEDS_RPM = (10.0, 20.0, 60.0, 150.0, 600.0, 1500.0)
@@ -55,6 +61,8 @@ def encoders(quick: bool) -> Iterator[Case]:
         for edges in (False, True):
             for bits in (10, 17) if quick else ENCODER_BITS:
                 for speed_rpm in (10.0, 600.0) if quick else ENCODER_SPEEDS_RPM:
+                    if not encoder_allows(machine, bits, speed_rpm):
+                        continue
                     condition = f"{machine}, {bits} bits{' and edge stamps' if edges else ''}, {speed_rpm:g} r/min"
                     for number in range(angles):
                         angle_deg = round(number * _stroke_deg(machine) / angles, 3)
@@ -62,6 +70,27 @@ def encoders(quick: bool) -> Iterator[Case]:
                                               initial_angle_deg=angle_deg)
                         yield from by_controller("encoders", condition, "encoder", scenario, f"angle {number:02}",
                                                  SALIENT)
+        for bits in COURSE_BITS[:1] if quick else COURSE_BITS:
+            for speed_rpm in (10.0,) if quick else COURSE_SPEEDS_RPM:
+                allowed = [name for name in CONTROLLERS if encoder_allows(machine, bits, speed_rpm, name)]
+                yield from by_controller("encoders", f"{machine}, {bits} bits, {speed_rpm:g} r/min, mean",
+                                         "encoder_course", _course(speed_rpm, machine=machine, encoder_bits=bits), "",
+                                         allowed)
+
+
+def encoder_allows(machine: str, bits: int, speed_rpm: float, controller: str = "salient") -> bool:
+    """False for a speed that the drive is refused with such an encoder."""
+    return speed_rpm >= lowest_speed_rpm(machine, bits, controller)
+
+
+def _course(speed_rpm: float, encoder_bits: int, **fields: Any) -> Scenario:
+    """A load step at a low speed, recorded from the time when it has settled, over COURSE_COUNTS counts or 2 s."""
+    assert encoder_bits <= COARSE_BITS
+    counts_s = COURSE_COUNTS * 60.0 / speed_rpm / 2**encoder_bits
+    settled_s = round(STEP_AT_S + 0.3 + max(COURSE_SETTLING_S, counts_s), 3)
+    return make_scenario(duration_s=round(settled_s + max(2.0, counts_s), 3), speed=(SpeedStep(0.0, speed_rpm),),
+                         load=(LoadStep(STEP_AT_S + 0.3, LOAD_NM),), encoder_bits=encoder_bits,
+                         record=Record(25.0, settled_s), **fields)
 
 
 def _load_step(speed_rpm: float, **fields: Any) -> Scenario:
