@@ -23,7 +23,8 @@ import numpy as np
 from salient.machine.definition import Machine
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
-from salient.machine.sharing_window import least_current_window_deg
+from salient.machine.least_current import least_current_deg, sharing_function
+from salient.machine.sharing_window import MORE_AT_REST
 
 COARSE_BITS = 12
 """Encoders of more bits have no lowest speed."""
@@ -57,25 +58,19 @@ def _lowest_rpm(name: str, encoder_bits: int) -> float:
 
 
 def error_growth_1_s(machine: Machine) -> float:
-    """s at RATED_PART of the rated torque: the larger one of the window with the least current and of the parameters',
-    where that makes the torque."""
+    """s at RATED_PART of the rated torque, with the machine's window of torque sharing at standstill."""
     data = derive(machine)
     torque_Nm = RATED_PART * data.torque_rated_Nm
-    windows_deg = (
-        least_current_window_deg(machine.magnetics, machine.phases, torque_Nm, data.current_peak_A),
-        (data.parameters["share_on_angle_deg"], data.parameters["share_off_angle_deg"]),
-    )
+    on_deg, off_deg = least_current_deg(machine.magnetics, machine.phases, torque_Nm,
+                                        data.parameters["current_limit_A"], MORE_AT_REST)
+    stroke_deg = 360.0 / machine.phases
     angle_rad = _ANGLES_DEG / 360.0 * machine.magnetics.pitch_rad
     grid_A = np.linspace(0.0, data.current_peak_A, _CURRENTS)
     made_Nm = machine.magnetics.torque_Nm(angle_rad[:, None], grid_A[None, :])
     slope_Nm_rad = np.gradient(made_Nm, angle_rad, axis=0)
-    most_Nm_rad = 0.0
-    for number, (on_deg, off_deg) in enumerate(windows_deg):
-        share_Nm = torque_Nm * _share(_ANGLES_DEG - on_deg, 360.0 / machine.phases,
-                                      off_deg - on_deg - 360.0 / machine.phases)
-        if number == 0 or np.all(made_Nm.max(axis=1) >= share_Nm):
-            most_Nm_rad = max(most_Nm_rad, _stiffness_Nm_rad(made_Nm, slope_Nm_rad, share_Nm, grid_A, machine.phases))
-    return math.sqrt(most_Nm_rad / machine.inertia_kg_m2)
+    share_Nm = torque_Nm * sharing_function(_ANGLES_DEG - 180.0 - on_deg, stroke_deg, off_deg - on_deg - stroke_deg)
+    most_Nm_rad = _stiffness_Nm_rad(made_Nm, slope_Nm_rad, share_Nm, grid_A, machine.phases)
+    return math.sqrt(max(most_Nm_rad, 0.0) / machine.inertia_kg_m2)
 
 
 def _stiffness_Nm_rad(made_Nm: np.ndarray, slope_Nm_rad: np.ndarray, share_Nm: np.ndarray, grid_A: np.ndarray,
@@ -88,10 +83,3 @@ def _stiffness_Nm_rad(made_Nm: np.ndarray, slope_Nm_rad: np.ndarray, share_Nm: n
         own_Nm_rad[row] = np.interp(current_A, grid_A, slope_Nm_rad[row])
     place = (_ANGLES_DEG % (360.0 / phases)).astype(int)
     return float(np.bincount(place, own_Nm_rad).max())
-
-
-def _share(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: float) -> np.ndarray:
-    """The cubic of firmware/control/torque_sharing.h."""
-    rise, fall = (np.clip(since / overlap_deg, 0.0, 1.0) for since in (since_on_deg, since_on_deg - stroke_deg))
-    share: np.ndarray = rise**2 * (3.0 - 2.0 * rise) - fall**2 * (3.0 - 2.0 * fall)
-    return share

@@ -31,7 +31,7 @@ _HALF = int(180 / _STEP_DEG)
 _TURN = 2 * _HALF
 _CURRENTS = 160
 _FLUX_POINTS = 64
-_MORE_AT_REST, _MORE_AT_SPEED = 0.03, 0.01
+MORE_AT_REST, _MORE_AT_SPEED = 0.03, 0.01
 """Of the square of the current, relatively, for which a window is wider: the torque of phases that share a revolution
 more evenly depends less on errors of angle and tables. At speed the voltage takes as much again."""
 _EARLIER_DEG = np.arange(0.0, 49.0, 3.0)
@@ -73,7 +73,7 @@ def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
                     data.parameters["torque_max_Nm"])
     parts_Nm = np.array(PARTS) * torque_Nm
     found_deg = np.array([[least_current_deg(machine.magnetics, machine.phases, of_Nm, limit_A, more)
-                           for more in (_MORE_AT_SPEED, _MORE_AT_REST)] for of_Nm in parts_Nm])
+                           for more in (_MORE_AT_SPEED, MORE_AT_REST)] for of_Nm in parts_Nm])
     phases = _Phases(machine, limit_A)
     base_rad_s = data.speed_base_rpm * math.pi / 30.0
     window_deg = []
