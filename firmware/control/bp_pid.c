@@ -26,14 +26,21 @@ void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15) {
     pid->duty_q23 = fixed_clamp(duty_q15, -ONE_Q15, ONE_Q15) * 256;
 }
 
+/* Q24 * Q24 to Q16: below 2^31 * 2^30 / 2^32. */
+ALWAYS_INLINE int32_t scaled_error_q16(const bp_pid_parameters_t *parameters, int32_t torque_error_q24) {
+    return fixed_saturate_bits(fixed_multiply_high(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
+}
+
+void bp_pid_set_error(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
+    pid->error_q16 = scaled_error_q16(parameters, torque_error_q24);
+}
+
 int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
     static const int32_t half_output_q27[BP_OUTPUTS] = {0}; /* f = 0: g = 1/2 */
     const bool learning = parameters->mode == BP_PID_LEARNING;
     const int32_t *output_q27 = half_output_q27;
 
-    /* Q24 * Q24 to Q16: below 2^31 * 2^30 / 2^32. */
-    const int32_t error_q16 =
-        fixed_saturate_bits(fixed_multiply_high(torque_error_q24, parameters->error_scale_inverse_q24), ERROR_BITS);
+    const int32_t error_q16 = scaled_error_q16(parameters, torque_error_q24);
     const int32_t error_difference_q16 = error_q16 - pid->error_q16;
     const int32_t second_difference_q16 = error_difference_q16 - pid->error_difference_q16;
     pid->error_q16 = error_q16;

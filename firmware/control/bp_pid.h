@@ -45,6 +45,9 @@ void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid);
 /* Sets the duty u(k-1), Q1.15, clamped to -32768..32768, for a bumpless transfer to another phase. */
 void bp_pid_preset(bp_pid_t *pid, int32_t duty_q15);
 
+/* Sets the last error e(k-1) in N m, Q7.24, any value, where the caller scales errors by a factor that has changed. */
+void bp_pid_set_error(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24);
+
 /* Sets duty and gains, which telemetry reports, to 0 while the PID is not in use. */
 void bp_pid_clear_telemetry(bp_pid_t *pid);
 

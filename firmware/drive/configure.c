@@ -39,6 +39,8 @@ static controller_t controller_from(const int32_t *values) {
         return (controller_t){
             .speed_law = SPEED_LAW_SMC,
             .torque_law = values[PARAMETER_BP_MODE] == BP_PID_OFF ? TORQUE_LAW_HYSTERESIS : TORQUE_LAW_DUTY,
+            .schedules_bandwidth = true,
+            .may_interleave_pulses = values[PARAMETER_BP_MODE] != BP_PID_OFF,
         };
     case DRIVE_CONTROLLER_TRADITIONAL:
     default:
@@ -189,6 +191,17 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     control->duty.current_limit_q9 = limit_q9;
     control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
+}
+
+/* A period's flux linkage at full voltage is that of the rise of the current at the unaligned position. */
+static void set_reference_point(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
+                                uint32_t control_rate_hz) {
+    const int64_t rise_q9 = fixed_divide((int64_t)tables->current_slew_rate_A_s << 9, control_rate_hz);
+    const uint32_t middle =
+        angle_from_degrees((values[PARAMETER_TURN_ON_ANGLE_DEG] + values[PARAMETER_TURN_OFF_ANGLE_DEG]) / 2);
+    const int32_t flux_q29 =
+        phase_map_flux_q29(tables, 0, fixed_clamp(fixed_saturate(rise_q9), 1, PHASE_MAP_CURRENT_MAX_Q9));
+    pwm_ditc_set_reference_point(&control->duty, tables, middle, flux_q29 > 0 ? flux_q29 : 1);
 }
 
 static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, bool schedules_bandwidth,
@@ -456,11 +469,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                 /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
                 .incoming_gain_q24 =
                     fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_slew_rate_A_s)),
-                /* 1/16 of the reference and 1/16 N m at 40 kHz: see pwm_ditc.h. */
-                .overshoot_margin_q32 = (int32_t)(((uint32_t)GAIN_RATE_HZ << 16) / control_rate_hz << 12),
-                .depleted_torque_q24 = (int32_t)fixed_divide((int64_t)control_rate_hz << 20, GAIN_RATE_HZ),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
-                .torque_shift = tables->torque_format.result_shift,
             },
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
@@ -478,6 +487,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     };
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
     limit_currents(&control, values, tables, control_rate_hz);
+    set_reference_point(&control, values, tables, control_rate_hz);
     control.degraded = degraded_from(&control, values);
     set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
     control.moving_load = moving_load_configure(&(moving_load_settings_t){

@@ -121,12 +121,12 @@ typedef struct {
 
 /* A sample in the formats of the control laws, and the torque and flux linkage that it implies. */
 typedef struct {
-    uint32_t encoder_angle;      /* start of the encoder count, 2^-32 rev */
-    uint32_t angle;              /* rotor, 2^-32 rev */
-    bool angle_from_edge;        /* extrapolated from the time of an encoder edge; false: middle of the count */
-    int32_t predicted_speed_q22; /* observer's prediction for this sample, rad/s, Q9.22 */
-    int32_t dc_link_voltage_q6;  /* V, Q9.6 */
-    commutation_t commutation;
+    uint32_t encoder_angle;             /* start of the encoder count, 2^-32 rev */
+    uint32_t angle;                     /* rotor, 2^-32 rev */
+    bool angle_from_edge;               /* extrapolated from the time of an encoder edge; false: middle of the count */
+    int32_t predicted_speed_q22;        /* observer's prediction for this sample, rad/s, Q9.22 */
+    int32_t dc_link_voltage_q6;         /* V, Q9.6 */
+    commutation_t commutation;          /* angle only: the torque laws find the roles of the phases */
     int32_t current_max_q9;             /* largest phase current, A, Q7.9 */
     int32_t torque_sum_q24;             /* machine torque, N m, Q7.24, saturated */
     int32_t current_q9[HAL_PHASES_MAX]; /* A, Q7.9 */

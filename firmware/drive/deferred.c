@@ -29,6 +29,7 @@ void deferred_reset_run(control_state_t *state) {
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.limit = kept->limit;
+    request->initial.duty = kept->duty;
     request->initial.predictive.conduction = CONDUCTION_INITIAL;
     request->initial.speed = (deferred_speed_results_t){0, 0, 0, 0, 0};
     request->generation = (generation & OBSERVER_MASK) | ((generation + 1) & RUN_MASK);
@@ -42,6 +43,7 @@ void deferred_reset_observer(control_state_t *state) {
     request->initial.predictive = kept->predictive;
     request->initial.observer = kept->observer;
     request->initial.limit = kept->limit;
+    request->initial.duty = kept->duty;
     request->initial.bandwidth = (observer_bandwidth_limits_t){0, 0, 0, 0};
     request->initial.slow_counts.slow = false;
     request->generation += OBSERVER_STEP;
@@ -62,6 +64,13 @@ static void hand_over_predictive(const control_state_t *state, const control_mea
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
+}
+
+static void hand_over_duty(const control_parameters_t *parameters, const control_state_t *state,
+                           const control_measurement_t *measured, deferred_input_t *input) {
+    const unsigned regulated = state->duty.regulated;
+    input->regulated_angle = commutation_angle(&parameters->commutation, &measured->commutation, regulated);
+    input->regulated_current_q9 = measured->current_q9[regulated];
 }
 
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -88,6 +97,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         hand_over_predictive(state, measured, input);
+    } else if (parameters->torque_law == TORQUE_LAW_DUTY && state->duty.regulated < HAL_PHASES_MAX) {
+        hand_over_duty(parameters, state, measured, input);
     }
     deferred_request(request);
 }
@@ -370,6 +381,17 @@ static void limit_currents(const control_parameters_t *parameters, const deferre
     }
 }
 
+static pwm_ditc_plan_t plan_duty(const control_parameters_t *parameters, const deferred_input_t *input,
+                                 const table_scale_factors_t *scale) {
+    const pwm_ditc_plan_sample_t sample = {
+        .angle = input->regulated_angle,
+        .current_q9 = input->regulated_current_q9,
+        .reference_q24 = table_scale_multiply(input->torque_reference_q24, scale->inverse_excess_q31),
+        .angle_step = rotation(parameters, input) * (int32_t)parameters->commutation.rotor_poles,
+    };
+    return pwm_ditc_plan(&parameters->duty, &machine_tables, &sample);
+}
+
 /* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
  * because at a high bandwidth of the observer it follows within a millisecond. */
 NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
@@ -440,6 +462,9 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
         if (deferred->slow_counts.slow) {
             learn_between_counts(parameters, deferred, input, state->flux_misalignment);
+        }
+        if (parameters->torque_law == TORQUE_LAW_DUTY) {
+            results->duty = plan_duty(parameters, input, &state->table_scale);
         }
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);

@@ -22,6 +22,7 @@
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
 #include "control/observer_bandwidth.h"
+#include "control/pwm_ditc.h"
 #include "control/slow_counts.h"
 #include "fixed/compiler.h"
 #include "hal.h"
@@ -41,6 +42,9 @@ typedef struct {
     int32_t torque_reference_q24; /* of this period, N m, Q7.24; 0 outside RUN */
     uint32_t electrical;          /* angle of phase 0, 2^-32 electrical rev */
     int32_t current_q9;           /* of the phase misalignment_t.phase_index, A, Q7.9 */
+    /* With torque control by the duty of the BP-PID only: of the phase that it regulates. */
+    uint32_t regulated_angle;     /* 2^-32 electrical rev */
+    int32_t regulated_current_q9; /* A, Q7.9 */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
@@ -75,6 +79,7 @@ typedef struct {
     load_observer_inertia_t observer; /* identified, inertia.h */
     slow_counts_results_t slow_counts;
     ditc_hysteresis_limit_t limit; /* without predictive torque control only */
+    pwm_ditc_plan_t duty;          /* with torque control by the duty of the BP-PID only */
 } deferred_results_t;
 
 typedef struct {

@@ -119,7 +119,6 @@ void measure_torque(const control_parameters_t *parameters, control_state_t *sta
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         sum = torque_by_plan(&state->predictive, measured);
     } else if (!failed) {
-        commutation_find(&parameters->commutation, &measured->commutation);
         sum = torque_by_map(parameters, misalignment, measured);
     }
     measured->torque_sum_q24 =

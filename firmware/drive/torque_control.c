@@ -40,13 +40,15 @@ static int32_t torque_error_q24(const control_state_t *state, const control_meas
 
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
                                const deferred_results_t *deferred, const control_measurement_t *measured) {
-    ditc_hysteresis_step(&parameters->hysteresis, &measured->commutation, torque_error_q24(state, measured),
-                         measured->current_q9, deferred->limit, state->duty_q15);
+    commutation_t commutation = {.electrical = measured->commutation.electrical};
+    commutation_find(&parameters->commutation, &commutation);
+    ditc_hysteresis_step(&parameters->hysteresis, &commutation, torque_error_q24(state, measured), measured->current_q9,
+                         deferred->limit, state->duty_q15);
 }
 
 /* False when hysteresis control is to act instead. */
 static bool duty_control(const control_parameters_t *parameters, control_state_t *state,
-                         const control_measurement_t *measured) {
+                         const deferred_results_t *deferred, const control_measurement_t *measured) {
     if (state->duty.regulated == COMMUTATION_NONE && state->torque_reference_q24 <= 0) {
         /* The speed law's first torque acts in the second period: the outgoing phase would count as depleted before. */
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
@@ -62,10 +64,12 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
         .torque = measured->torque,
-        .reference_q24 = table_scale_multiply(state->torque_reference_q24, state->table_scale.inverse_excess_q31),
         .error_q24 = torque_error_q24(state, measured),
+        .plan = &deferred->duty,
     };
-    pwm_ditc_step(&parameters->duty, &state->duty, &measured->commutation, &sample, state->duty_q15);
+    commutation_t ahead = {.electrical = measured->commutation.electrical + deferred->duty.lead};
+    commutation_find(&parameters->commutation, &ahead);
+    pwm_ditc_step(&parameters->duty, &state->duty, &ahead, &sample, state->duty_q15);
     return true;
 }
 
@@ -105,7 +109,7 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
         predictive_control(parameters, state, deferred, measured);
         return;
     }
-    if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, measured)) {
+    if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, deferred, measured)) {
         hysteresis_control(parameters, state, deferred, measured); /* in one place, so that it is inlined */
     }
     const uint32_t lost = state->lost_phase;

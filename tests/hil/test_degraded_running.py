@@ -76,7 +76,9 @@ def test_reported_torque_is_what_the_other_phases_make(make_bench, machine, cont
     assert torque_Nm.mean() == pytest.approx(mean_Nm, rel=0.06)
     # With windows up to the aligned position a current ends a little past it.
     assert torque_Nm.min() > -0.6
-    assert degraded(bench, "torque_least_Nm") == pytest.approx(max(torque_Nm.min(), 0.0), abs=0.05)
+    # paper charges a phase shortly before its unaligned position, where it brakes by less than a tenth of a newton metre.
+    tolerance_Nm = 0.1 if controller == "paper" else 0.05
+    assert degraded(bench, "torque_least_Nm") == pytest.approx(max(torque_Nm.min(), 0.0), abs=tolerance_Nm)
 
 
 def test_loss_of_a_phase_is_a_fault_by_default(make_bench):

@@ -20,7 +20,8 @@ namespace {
 using namespace fixed_point;
 constexpr int32_t LIMIT_Q9 = 52 << 9;
 
-const uint32_t CROSSOVER = electrical_angle(210.0);
+const uint32_t CROSSOVER = electrical_angle(210.0), MIDDLE = electrical_angle(240.0);
+const int32_t VOLTAGE_STEP_Q29 = to_fixed(240.0 / 40e3, Q29);
 const commutation_angles_t ANGLES = {
     .turn_on = electrical_angle(180.0), .turn_off = electrical_angle(300.0), .outgoing_off = electrical_angle(348.0)};
 
@@ -53,13 +54,11 @@ pwm_ditc_parameters_t parameters_of(bp_pid_mode_t mode) {
     parameters.pid.network = {.learning_rate_q15 = 1638, .momentum_q32 = 1638 << 17};
     parameters.current_setpoints = pwm_ditc_setpoints(&machine_tables, CROSSOVER);
     parameters.incoming_gain_q24 = 58544 << 4; // 40 kHz, 358 A/ms
-    parameters.overshoot_margin_q32 = 1 << 28;
-    parameters.depleted_torque_q24 = 1 << 20;
     parameters.band_outer_q24 = 2 << 24;
     parameters.current_limit_q9 = LIMIT_Q9;
     parameters.current_ceiling_q9 = 74 << 9;
     parameters.ceiling_gain_q24 = (1 << 24) / 9; // 9 A in a period
-    parameters.torque_shift = machine_tables.torque_format.result_shift;
+    pwm_ditc_set_reference_point(&parameters, &machine_tables, MIDDLE, VOLTAGE_STEP_Q29);
     return parameters;
 }
 
@@ -69,9 +68,10 @@ class PwmDitc : public testing::Test {
 
     // One sample with the torques of the phase map for the currents.
     void step(const roles_t &commutation, double reference_Nm) {
-        pwm_ditc_sample_t sample{
-            .current_q9 = current_q9, .torque = torque, .reference_q24 = to_fixed(reference_Nm, Q24), .error_q24 = 0};
-        sample.error_q24 = sample.reference_q24;
+        const int32_t reference_q24 = to_fixed(reference_Nm, Q24);
+        plan.setpoint_q9 =
+            std::min(pwm_ditc_setpoint_q9(&parameters.current_setpoints, reference_q24), parameters.current_limit_q9);
+        pwm_ditc_sample_t sample{.current_q9 = current_q9, .torque = torque, .error_q24 = reference_q24, .plan = &plan};
         for (unsigned phase = 0; phase < 3; phase++) {
             torque[phase] = phase_map_torque(&machine_tables, commutation.angle[phase], current_q9[phase]);
             sample.error_q24 -= phase_map_scale(&machine_tables.torque_format, torque[phase]);
@@ -82,7 +82,14 @@ class PwmDitc : public testing::Test {
 
     pwm_ditc_parameters_t parameters = parameters_of(BP_PID_FIXED);
     pwm_ditc_t ditc{};
+    pwm_ditc_plan_t plan{.factor_q16 = 1 << 16, .duty_per_torque_q47 = 0, .setpoint_q9 = 0, .lead = 0};
     int32_t current_q9[HAL_PHASES_MAX] = {0, 0, 0, 0};
+    pwm_ditc_plan_t plan_of(uint32_t angle, int32_t phase_q9, int32_t reference_q24 = 8 << 24, int32_t step = 0) const {
+        const pwm_ditc_plan_sample_t sample{
+            .angle = angle, .current_q9 = phase_q9, .reference_q24 = reference_q24, .angle_step = step};
+        return pwm_ditc_plan(&parameters, &machine_tables, &sample);
+    }
+
     double torque_Nm(unsigned phase) const {
         return std::ldexp(torque[phase], machine_tables.torque_format.result_shift) / Q24;
     }
@@ -118,10 +125,16 @@ TEST_F(PwmDitc, a_single_phase_gets_the_duty_of_the_pid_and_the_others_are_off) 
     ASSERT_EQ(commutation.outgoing, unsigned(COMMUTATION_NONE));
     bp_pid_t pid;
     bp_pid_reset(&parameters.pid, &pid);
+    int32_t last_q24 = 0;
     for (int k = 0; k < 50; k++) {
         current_q9[0] = (k % 30) << 9;
+        plan.factor_q16 = (1 + k % 4) << 15;
         step(commutation, 5.0);
-        EXPECT_EQ(duty_q15[0], bp_pid_step(&parameters.pid, &pid, error_q24));
+        // Both errors times the present factor: a factor that changes is no change of the error.
+        const auto normalised = [&](int32_t raw_q24) { return int32_t(int64_t(raw_q24) * plan.factor_q16 >> 16); };
+        bp_pid_set_error(&parameters.pid, &pid, normalised(last_q24));
+        EXPECT_EQ(duty_q15[0], bp_pid_step(&parameters.pid, &pid, normalised(error_q24)));
+        last_q24 = error_q24;
         EXPECT_EQ(duty_q15[1], -ONE_Q15);
         EXPECT_EQ(duty_q15[2], -ONE_Q15);
     }
@@ -148,52 +161,183 @@ TEST_F(PwmDitc, from_standstill_a_phase_past_its_window_is_regulated_and_the_nex
     EXPECT_EQ(duty_q15[2], -ONE_Q15);
 }
 
-TEST_F(PwmDitc, the_incoming_phase_is_driven_to_the_current_that_will_carry_the_reference) {
+TEST_F(PwmDitc, the_incoming_phase_is_driven_by_half_of_a_deadbeat_law_to_the_current_that_will_carry_the_reference) {
     // Phase 0 is outgoing with about the reference torque: no shortfall beyond the band.
-    const roles_t commutation = commutation_of(305.0);
+    const roles_t commutation = commutation_of(300.5);
     ASSERT_EQ(commutation.active, 1u);
     for (double reference = 0.5; reference < 14.0; reference += 0.25) {
         pwm_ditc_reset(&parameters, &ditc);
         current_q9[0] = map_current_q9(commutation.angle[0], to_fixed(reference, Q24));
-        const double carrying_A =
-            pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference * 17 / 16, Q24)) / Q9;
+        const double carrying_A = pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference, Q24)) / Q9;
         const double target_A = std::min(carrying_A, LIMIT_Q9 / Q9);
+        duty_q15[1] = -ONE_Q15;
         for (int current_A = 0; current_A < 60; current_A += 3) {
             current_q9[1] = current_A << 9;
+            const double acting = duty_q15[1] == -ONE_Q15 ? 0.0 : duty_q15[1] / Q15;
             step(commutation, reference);
             ASSERT_EQ(ditc.regulated, 0u);
-            const double exact = std::clamp((target_A - current_A) * parameters.incoming_gain_q24 / Q24, -1.0, 1.0);
-            ASSERT_NEAR(duty_q15[1] / Q15, exact, 1.0 / Q15) << reference << " " << current_A;
+            const double wanted = (target_A - current_A) * parameters.incoming_gain_q24 / Q24;
+            ASSERT_NEAR(duty_q15[1] / Q15, std::clamp(wanted - acting / 2.0, -1.0, 1.0), 2.0 / Q15)
+                << reference << " " << current_A;
         }
     }
 }
 
-TEST_F(PwmDitc, the_pid_switches_over_when_the_outgoing_phase_is_depleted_and_starts_from_the_incoming_duty) {
+TEST_F(PwmDitc, the_current_of_the_incoming_phase_does_not_overshoot_and_settles_at_any_larger_inductance) {
+    const roles_t commutation = commutation_of(301.0);
+    const double reference = 8.0;
+    const double target_A = pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference, Q24)) / Q9;
+    const double rise_A = 0.5 / (parameters.incoming_gain_q24 / Q24);
+    for (const double inductance : {1.0, 1.5, 3.0, 10.0}) {
+        pwm_ditc_reset(&parameters, &ditc);
+        std::fill(std::begin(duty_q15), std::end(duty_q15), -ONE_Q15);
+        current_q9[0] = map_current_q9(commutation.angle[0], to_fixed(reference, Q24));
+        double current_A = 0.0, most_A = 0.0;
+        for (int k = 0; k < 300; k++) {
+            const double acting = duty_q15[1] == -ONE_Q15 ? 0.0 : duty_q15[1] / Q15;
+            current_q9[1] = to_fixed(current_A, Q9);
+            step(commutation, reference);
+            ASSERT_EQ(ditc.regulated, 0u) << k;
+            current_A += acting * rise_A / inductance;
+            most_A = std::max(most_A, current_A);
+        }
+        EXPECT_NEAR(current_A, target_A, 0.02) << inductance;
+        EXPECT_LT(most_A, 1.01 * target_A) << inductance;
+    }
+}
+
+TEST_F(PwmDitc, the_pid_changes_phases_when_the_incoming_one_has_the_larger_torque_and_none_is_missing) {
+    const roles_t commutation = commutation_of(320.0);
+    unsigned changed = 0, missing = 0, smaller = 0;
+    for (double reference = 0.0; reference < 16.0; reference += 0.5) {
+        for (int outgoing_A = 0; outgoing_A < 52; outgoing_A += 2) {
+            for (int incoming_A = 0; incoming_A < 52; incoming_A += 2) {
+                pwm_ditc_reset(&parameters, &ditc);
+                current_q9[0] = outgoing_A << 9;
+                current_q9[1] = incoming_A << 9;
+                step(commutation, reference);
+                const bool larger = torque[1] >= torque[0];
+                ASSERT_EQ(ditc.regulated, larger && error_q24 <= 0 ? 1u : 0u);
+                changed += ditc.regulated == 1u;
+                missing += larger && error_q24 > 0;
+                smaller += !larger && error_q24 <= 0;
+            }
+        }
+    }
+    EXPECT_GT(std::min({changed, missing, smaller}), 1000u);
+}
+
+TEST_F(PwmDitc, a_change_of_phases_is_bumpless_and_the_outgoing_phase_keeps_its_mean_duty) {
     const roles_t commutation = commutation_of(320.0);
     current_q9[0] = 20 << 9;
     current_q9[1] = 10 << 9;
+    std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0); // the PID keeps its duty
     step(commutation, 4.0);
+    const double reference = torque_Nm(1); // of the incoming phase alone
+    bp_pid_preset(&ditc.pid, -9000);
+    for (int k = 0; k < 40; k++) {
+        step(commutation, reference);
+    }
     ASSERT_EQ(ditc.regulated, 0u);
-    // Outgoing torque left: no switch-over, although the error is negative.
-    step(commutation, 1.0);
-    ASSERT_LT(error_q24, 0);
-    EXPECT_EQ(ditc.regulated, 0u);
-    // No torque left, but a shortfall: no switch-over, both phases build up torque.
-    current_q9[0] = 0;
-    step(commutation, 8.0);
-    ASSERT_GT(error_q24, 0);
-    EXPECT_EQ(ditc.regulated, 0u);
-    // No torque left and no shortfall.
+    ASSERT_EQ(duty_q15[0], -9000);
+    const int32_t held_q15 = duty_q15[1];
+    current_q9[0] = 4 << 9;
+    for (int k = 0; k < 20; k++) { // and it does not change back
+        step(commutation, reference);
+        ASSERT_EQ(ditc.regulated, 1u);
+        EXPECT_NEAR(duty_q15[0], -9000, 4);
+        EXPECT_NEAR(duty_q15[1], held_q15, 2) << "the duty that the law of the current has settled to";
+        current_q9[0] = 8 << 9;
+    }
+}
+
+TEST_F(PwmDitc, an_outgoing_phase_that_was_left_gets_no_voltage_that_raises_it_unless_torque_is_missing) {
+    const roles_t commutation = commutation_of(320.0);
+    current_q9[0] = 4 << 9;
     current_q9[1] = 12 << 9;
-    const double reference = torque_Nm(1);
-    step(commutation, 0.5 * reference);
-    ASSERT_LE(error_q24, 0);
-    EXPECT_EQ(ditc.regulated, 1u);
+    step(commutation, 0.5);
+    ASSERT_EQ(ditc.regulated, 1u);
+    ditc.released_q15 = 5000;
+    step(commutation, 1.0);
+    EXPECT_EQ(duty_q15[0], 0);
+    step(commutation, 16.0);
+    ASSERT_GT(error_q24, parameters.band_outer_q24);
+    EXPECT_GT(duty_q15[0], ONE_Q15 / 2);
+    current_q9[0] = LIMIT_Q9 + 1;
+    step(commutation, 40.0);
+    ASSERT_GT(error_q24, parameters.band_outer_q24);
+    EXPECT_EQ(duty_q15[0], 0) << "above the current limit";
+    step(commutation, 0.0);
+    ASSERT_LT(error_q24, -parameters.band_outer_q24);
     EXPECT_EQ(duty_q15[0], -ONE_Q15);
-    // It does not switch back.
-    current_q9[0] = 20 << 9;
-    step(commutation, 8.0);
-    EXPECT_EQ(ditc.regulated, 1u);
+    step(commutation_of(349.0), 1.0);
+    EXPECT_EQ(duty_q15[0], -ONE_Q15) << "no longer available";
+}
+
+TEST_F(PwmDitc, what_the_incoming_phase_gains_in_torque_is_taken_from_the_duty_of_the_outgoing_one) {
+    const roles_t commutation = commutation_of(310.0);
+    std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0);
+    plan.duty_per_torque_q47 = parameters.duty_per_torque_q44 << 3;
+    current_q9[0] = 25 << 9;
+    double last_Nm = 0.0, largest = 0.0;
+    for (int k = 0; k < 30; k++) {
+        current_q9[1] = (k + k % 3) << 9;
+        step(commutation, 12.0);
+        ASSERT_EQ(ditc.regulated, 0u);
+        const double per_Nm = parameters.duty_per_torque_q44 / std::ldexp(1.0, 44) * Q24 /
+                              std::ldexp(1.0, machine_tables.torque_format.result_shift);
+        const double forward = -(torque_Nm(1) - last_Nm) * per_Nm;
+        EXPECT_NEAR(duty_q15[0] / Q15, std::max(forward, -1.0), 2.0 / Q15) << k;
+        largest = std::max(largest, std::fabs(forward));
+        last_Nm = torque_Nm(1);
+    }
+    EXPECT_GT(largest, 0.05);
+}
+
+// dT/dpsi in N m/Wb by differences of 1 %.
+double torque_per_flux(uint32_t angle, double current_A) {
+    const int32_t low_q9 = to_fixed(0.995 * current_A, Q9), high_q9 = to_fixed(1.14 * current_A, Q9);
+    const uint32_t distance = phase_map_distance(angle);
+    return (map_torque_q24(angle, high_q9) - map_torque_q24(angle, low_q9)) / Q24 /
+           ((phase_map_flux_q29(&machine_tables, distance, high_q9) -
+             phase_map_flux_q29(&machine_tables, distance, low_q9)) /
+            Q29);
+}
+
+TEST_F(PwmDitc, the_plan_makes_the_gain_of_the_loop_the_same_at_every_angle_and_current) {
+    const double reference = torque_per_flux(MIDDLE, LIMIT_Q9 / Q9 / 2.0);
+    const double unit = std::ldexp(1.0, machine_tables.torque_format.result_shift) / Q24; // N m
+    unsigned inside = 0, limited = 0;
+    for (double deg = 182.0; deg < 355.0; deg += 3.0) {
+        for (double current_A = 4.0; current_A < 60.0; current_A += 3.0) {
+            const uint32_t angle = electrical_angle(deg);
+            const pwm_ditc_plan_t at = plan_of(angle, to_fixed(current_A, Q9));
+            const double exact = reference / torque_per_flux(angle, current_A);
+            const double expected = std::clamp(exact, 1.0 / 32.0, 4.0);
+            ASSERT_NEAR(at.factor_q16 / Q16, expected, 0.06 * expected) << deg << " " << current_A;
+            const double duty_per_Nm = at.factor_q16 / Q16 / (reference * 240.0 / 40e3);
+            ASSERT_NEAR(at.duty_per_torque_q47 / std::ldexp(1.0, 47) / unit, duty_per_Nm, 0.05 * duty_per_Nm);
+            (exact > 1.0 / 32.0 && exact < 4.0 ? inside : limited)++;
+        }
+    }
+    EXPECT_GT(inside, 600u);
+    EXPECT_GT(limited, 20u);
+    EXPECT_EQ(plan_of(electrical_angle(90.0), 10 << 9).factor_q16, 4 << 16) << "negative torque";
+    EXPECT_EQ(plan_of(MIDDLE, 10 << 9, 100 << 24).setpoint_q9, LIMIT_Q9) << "within the limit";
+}
+
+TEST_F(PwmDitc, the_lead_is_the_rotation_in_two_periods_and_half_of_the_rise_of_the_current) {
+    for (const double reference : {0.0, 2.0, 8.0, 16.0}) {
+        const int32_t reference_q24 = to_fixed(reference, Q24);
+        const double setpoint_A =
+            std::min(pwm_ditc_setpoint_q9(&parameters.current_setpoints, reference_q24), LIMIT_Q9) / Q9;
+        const double periods = 2.0 + setpoint_A * parameters.incoming_gain_q24 / Q24;
+        for (const int32_t step : {0, 1, 268000, -268000, 40000000}) {
+            EXPECT_NEAR(int32_t(plan_of(MIDDLE, 10 << 9, reference_q24, step).lead), periods * step,
+                        2.0 + std::fabs(step) / Q15)
+                << reference << " " << step;
+        }
+    }
 }
 
 TEST(PwmDitcSetpoints, of_a_negative_torque_is_that_of_none) {
@@ -233,46 +377,6 @@ TEST(PwmDitcSetpoints, are_the_currents_of_the_phase_map_within_2_percent_and_sm
     }
 }
 
-TEST_F(PwmDitc, the_current_setpoint_of_the_incoming_phase_includes_the_overshoot_margin) {
-    const roles_t commutation = commutation_of(305.0);
-    const double reference = 8.0;
-    parameters.incoming_gain_q24 = 1 << 20; // no saturation
-    current_q9[0] = map_current_q9(commutation.angle[0], to_fixed(reference, Q24));
-    for (const double margin : {0.0, 1.0 / 400.0, 1.0 / 16.0, 1.0 / 8.0}) {
-        parameters.overshoot_margin_q32 = int32_t(margin * Q32);
-        pwm_ditc_reset(&parameters, &ditc);
-        const double setpoint_A =
-            pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference * (1.0 + margin), Q24)) / Q9;
-        current_q9[1] = int32_t(setpoint_A) << 9;
-        step(commutation, reference);
-        ASSERT_NEAR(duty_q15[1] / Q15, (setpoint_A - std::floor(setpoint_A)) / 16.0, 2.0 / Q15) << margin;
-    }
-}
-
-TEST_F(PwmDitc, an_outgoing_phase_is_depleted_below_the_depleted_torque_an_eighth_of_the_reference_or_a_sixteenth_Nm) {
-    const roles_t commutation = commutation_of(320.0);
-    unsigned switched = 0, kept = 0;
-    for (const double depleted_Nm : {0.0, 0.03, 0.0625, 0.5, 1.5}) {
-        parameters.depleted_torque_q24 = to_fixed(depleted_Nm, Q24);
-        for (double reference = 0.0; reference < 16.0; reference += 0.5) {
-            for (int current_eighth_A = 0; current_eighth_A < 80; current_eighth_A++) {
-                pwm_ditc_reset(&parameters, &ditc);
-                current_q9[0] = current_eighth_A << 6;
-                current_q9[1] = 52 << 9;
-                step(commutation, reference);
-                const double limit = std::max(0.0625, std::min(reference / 8.0, depleted_Nm));
-                const bool depleted = torque_Nm(0) < limit && error_q24 <= 0;
-                ASSERT_EQ(ditc.regulated, depleted ? 1u : 0u)
-                    << depleted_Nm << " " << reference << " " << current_eighth_A;
-                switched += depleted;
-                kept += !depleted && error_q24 <= 0;
-            }
-        }
-    }
-    EXPECT_GT(switched, 500u);
-    EXPECT_GT(kept, 500u);
-}
-
 TEST_F(PwmDitc,
        the_pid_switches_over_when_the_outgoing_phase_is_no_longer_available_and_starts_from_the_incoming_duty) {
     current_q9[0] = 20 << 9;
@@ -303,7 +407,7 @@ TEST_F(PwmDitc, a_phase_above_the_current_limit_is_never_driven) {
         for (unsigned phase = 0; phase < 3; phase++) {
             ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
             ASSERT_TRUE(duty_q15[phase] <= 0 || current_q9[phase] <= LIMIT_Q9);
-            if (phase != ditc.regulated && phase != commutation.active) {
+            if (phase != ditc.regulated && phase != commutation.active && phase != commutation.outgoing) {
                 ASSERT_EQ(duty_q15[phase], -ONE_Q15);
             }
         }
@@ -343,8 +447,6 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
         for (const bp_pid_mode_t mode : {BP_PID_FIXED, BP_PID_FROZEN, BP_PID_LEARNING}) {
             parameters = parameters_of(mode);
             parameters.incoming_gain_q24 = gain;
-            parameters.overshoot_margin_q32 = gain;
-            parameters.depleted_torque_q24 = gain;
             parameters.ceiling_gain_q24 = gain;
             pwm_ditc_reset(&parameters, &ditc);
             for (int k = 0; k < 3000; k++) {
@@ -353,10 +455,12 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
                     current_q9[phase] = int32_t(random() % 40951);
                     torque[phase] = ends[random() % 5];
                 }
-                const pwm_ditc_sample_t sample = {.current_q9 = current_q9,
-                                                  .torque = torque,
-                                                  .reference_q24 = int32_t(random() >> 1),
-                                                  .error_q24 = ends[random() % 5]};
+                plan = {.factor_q16 = int32_t(random() % ((4 << 16) + 1)),
+                        .duty_per_torque_q47 = gain,
+                        .setpoint_q9 = int32_t(random() % LIMIT_Q9),
+                        .lead = 0};
+                const pwm_ditc_sample_t sample = {
+                    .current_q9 = current_q9, .torque = torque, .error_q24 = ends[random() % 5], .plan = &plan};
                 pwm_ditc_step(&parameters, &ditc, &commutation, &sample, duty_q15);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);

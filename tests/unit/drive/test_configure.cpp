@@ -152,8 +152,6 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("incoming gain", c.duty.incoming_gain_q24,
          0.5 * rate_hz / machine_tables.current_slew_rate_A_s * fixed_point::Q24, 1.0);
 
-    near("surplus", c.duty.overshoot_margin_q32, 40000.0 / 16.0 / rate_hz * fixed_point::Q32, 4096.0);
-    near("depleted torque", c.duty.depleted_torque_q24, rate_hz / 40000.0 / 16.0 * fixed_point::Q24, 1.0);
     ASSERT_EQ(int(c.duty.pid.mode), p.values[PARAMETER_BP_MODE]);
     ASSERT_EQ(int32_t(c.duty.pid.seed), p.values[PARAMETER_BP_SEED]);
     near("scale", c.duty.pid.error_scale_inverse_q24, fixed_point::Q24 / scale_Nm, 1.0);
@@ -193,7 +191,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const double width = std::max(asked_width, stroke + least);
     const double narrowing =
         std::min(pitch(PARAMETER_SHARE_OFF_EARLY_DEG) - on_early, width - stroke - least); // at full advance
-    ASSERT_EQ(c.interleaved_pwm, salient && p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
+    ASSERT_EQ(c.interleaved_pwm,
+              (salient || c.torque_law == TORQUE_LAW_DUTY) && p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
     ASSERT_EQ(c.load_from_transducer, p.values[PARAMETER_LOAD_SOURCE] == 1);
     ASSERT_EQ(share.overlapping, p.values[PARAMETER_TORQUE_SHARING] == 1);
     near("stroke", share.stroke, 0.0, fixed_point::REV);
@@ -251,8 +250,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const uint32_t rate = uint32_t(rate_hz);
     const int32_t inertia_q30 = p.values[PARAMETER_INERTIA_KG_M2];
     const load_observer_model_t observer = load_observer_model(rate, inertia_q30, p.values[PARAMETER_FRICTION_NM_S]);
+    const bool schedules = p.values[PARAMETER_CONTROLLER] != DRIVE_CONTROLLER_TRADITIONAL;
     const auto set_rad_s =
-        uint32_t(p.values[salient ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]);
+        uint32_t(p.values[schedules ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]);
     const uint32_t steady_rad_s = c.bandwidth.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
     ASSERT_LE(steady_rad_s, set_rad_s);
     ASSERT_TRUE(steady_rad_s == set_rad_s || c.bandwidth.adaptive) << "limited to what the encoder allows";
@@ -262,11 +262,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
     ASSERT_EQ(steady.load_gain_q28, gains.load_gain_q28);
     ASSERT_EQ(steady.load_factor_q4, gains.load_factor_q4);
-    const bool wakes = salient && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
+    const bool wakes = schedules && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
                        p.values[PARAMETER_OBSERVER_WAKE_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
-    const parameter_index_t widest = wakes     ? PARAMETER_OBSERVER_WAKE_RAD_S
-                                     : salient ? PARAMETER_OBSERVER_STEADY_RAD_S
-                                               : PARAMETER_OBSERVER_BANDWIDTH_RAD_S;
+    const parameter_index_t widest = wakes       ? PARAMETER_OBSERVER_WAKE_RAD_S
+                                     : schedules ? PARAMETER_OBSERVER_STEADY_RAD_S
+                                                 : PARAMETER_OBSERVER_BANDWIDTH_RAD_S;
     ASSERT_EQ(c.bandwidth.bandwidth_rad_s[0], p.values[widest]);
     ASSERT_EQ(c.bandwidth.threshold_count == UINT32_MAX, !wakes);
     ASSERT_EQ(c.bandwidth.threshold_edge == UINT32_MAX, !wakes);

@@ -377,6 +377,7 @@ TEST_F(Control, hysteresis_control_switches_whole_periods_only) {
 }
 
 TEST_F(Control, the_paper_controller_applies_the_duty_of_the_pid_to_the_regulated_phase) {
+    turns = 60.0 / 360.0; // phase a in the middle of its window
     start();
     int partial = 0;
     for (int k = 0; k < 2000; k++) {
@@ -388,9 +389,9 @@ TEST_F(Control, the_paper_controller_applies_the_duty_of_the_pid_to_the_regulate
         const double voltage = (double(compare.upper[phase]) + compare.lower[phase]) / parameters.period_ticks - 1.0;
         ASSERT_NEAR(voltage, duty, 0.51 / parameters.period_ticks + 0.51 / fixed_point::Q15) << k;
         partial += compare.upper[phase] > 0 && compare.upper[phase] < parameters.period_ticks;
-        // The current follows the voltage, 8 A a period at most; the rotor is held.
+        // The current follows the voltage, half an ampere a period at the inductance there; the rotor is held.
         uint16_t &counts = sample.adc.phase_current_counts[phase];
-        counts = uint16_t(std::clamp(counts + 400.0 * voltage, 0.0, 3000.0));
+        counts = uint16_t(std::clamp(counts + 25.0 * voltage, 0.0, 2500.0));
     }
     EXPECT_GT(partial, 10);
 }
