@@ -6,11 +6,17 @@
 #include "fixed/fixed.h"
 
 #define TIME_CONSTANT_US 1600
+/* After which 5 % of a trend are left. */
+#define SETTLING_TIME_CONSTANTS 3
+
 #define HOLD_MS 25
 #define HOLDS_MAX 32
 #define RELEASE_MS 5
 #define BLOCKED_MS 1000
 #define STILL_MS 500
+
+/* Ratios p / q up to this q: the trend of the next ones is below 1/14 count. */
+#define ROUNDING_RATIOS 6u
 
 #define HALF_PI_Q7 201
 
@@ -56,19 +62,11 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
         .hold_ticks_min = ticks_per_ms * HOLD_MS,
         .hold_ticks_max = ticks_per_ms * HOLD_MS * HOLDS_MAX,
         .release_ticks = ticks_per_ms * RELEASE_MS,
+        .settling_ticks = settings->trigger_ticks + SETTLING_TIME_CONSTANTS * time_constant,
         .still_reviews = ticks_per_ms * STILL_MS / settings->periods_per_review,
         .movement_min_q24 = movement_min_q24(settings),
         .stages = settings->stages,
     };
-}
-
-/* Largest trend that rounding to counts causes when only few of them pass within the time constant: half a count up to
- * one, then less by their number. Q28.4. */
-static uint32_t rounding_q4(const moving_load_parameters_t *parameters, uint32_t angle_step) {
-    const uint32_t counts =
-        (angle_step * parameters->time_constant) >>
-        parameters->encoder_shift; /* at most 1.05 rev: a longer way wraps and the threshold rises */
-    return (8u << parameters->encoder_shift) / (counts / 2 + 1);
 }
 
 /* A load that has been still long enough for a trend to be ripple: 156 ms or 0.5 s. */
@@ -81,6 +79,7 @@ static bool still(const moving_load_parameters_t *parameters, const moving_load_
 static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving) {
     uint32_t hold_ticks = moving->hold_ticks;
     if (moving->withheld < parameters->stages) {
+        moving->first = hold_ticks == 0;
         hold_ticks *= 2;
         if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
             if (moving->source == MOVING_LOAD_SOURCE_RIPPLE) {
@@ -98,8 +97,36 @@ static void withhold(const moving_load_parameters_t *parameters, moving_load_t *
     moving->ticks = moving->hold_ticks;
 }
 
+/* A load step has a trend before its first trigger: what that has withheld is released. Only the first time, until
+ * hold_ticks has decayed: a load that moves goes on. */
+static void begin_settling(const moving_load_parameters_t *parameters, moving_load_t *moving) {
+    moving->settling = parameters->settling_ticks;
+    if (moving->first) {
+        moving->withheld = 0;
+        moving->ticks = moving->hold_ticks;
+    }
+    moving->first = false;
+}
+
+uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, moving_load_rounding_t *rounding,
+                                 uint32_t angle_step) {
+    const uint32_t step_q32 = angle_step << (31u - parameters->encoder_shift) << 1; /* counts modulo 1 */
+    const uint32_t q = rounding->q + 1;
+    const uint32_t distance_q15 = fixed_magnitude((int32_t)(q * step_q32)) >> 17; /* at most 2^14 */
+    const uint32_t quarters = (distance_q15 * parameters->time_constant) >> 13;   /* of the beats; below 2^12 */
+    const uint32_t divisor = q * (quarters + 1);
+    const uint32_t least = q == 1 || divisor < rounding->least ? divisor : rounding->least;
+    rounding->least = least;
+    rounding->q = q;
+    if (q == ROUNDING_RATIOS) {
+        rounding->q = 0;
+        rounding->rounding_q4 = (8u << parameters->encoder_shift) / least;
+    }
+    return rounding->rounding_q4;
+}
+
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t angle_step, bool from_edge, bool hold) {
+                          uint32_t rounding_q4, bool from_edge, bool triggered, bool hold) {
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
         fixed_accumulate(moving->trend_q36, fixed_subtract(innovation * 16, trend_q4), parameters->gain_q32);
@@ -107,15 +134,17 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         moving->blocked--;
         return 0;
     }
-    const uint32_t base_q4 =
-        from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4(parameters, angle_step);
+    const uint32_t base_q4 = from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
     const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
+    if (triggered) {
+        begin_settling(parameters, moving);
+    }
     moving->settling -= moving->settling > 0;
-    if (magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0 && moving->settling == 0) {
+    if (moving->settling == 0 && magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0) {
         moving->withheld = 0;
         moving->blocked = parameters->blocked_ticks;
-    } else if (magnitude_q4 > threshold_q4) {
+    } else if (moving->settling == 0 && magnitude_q4 > threshold_q4) {
         withhold(parameters, moving);
     } else if (moving->ticks > 0) {
         moving->ticks -= !hold;

@@ -25,11 +25,22 @@
  * return for 0.5 s, as often as that happens. More than that factor would let the innovation reach the count at
  * which observer_bandwidth.h takes it for a load step.
  *
- * Rounding to counts leaves up to 1/40 of a count of it as noise. A trend of 1/8 count withholds the last stages of the
- * bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend, one each
- * 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The values are found by trial: a
- * threshold of 1/11 count takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5 makes
- * the speed drop of a load ramp of 200 ms that of the paper's controller twice over. */
+ * Rounding to counts has a trend of its own. While the rotor turns by r = p / q + d counts in a period, the errors of q
+ * successive samples are spread evenly over a count, and their mean is a sawtooth of +-1 / (2 q) counts that repeats
+ * q |d| times in a period. Of n repetitions within the time constant T a low-pass leaves 1 / (8 q n) for large n
+ * (integral of half a wave, over T), and 1 / (2 q) for n = 0:
+ *
+ *   rounding = max over q of 1 / (2 q) / (4 n + 1) counts,   n = |q r - p| T / Ts
+ *
+ * which is added to a threshold of 1/8 count, below which all q > 4 stay by themselves. A trend withholds the last
+ * stages of the bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such
+ * trend, one each 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The value 1/8 is
+ * found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5
+ * makes the speed drop of a load ramp of 200 ms that of the paper's controller twice over.
+ *
+ * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is none of
+ * the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
+ * constants more, which remove the trend. What the step withheld before its trigger is released then, once. */
 #ifndef CONTROL_MOVING_LOAD_H
 #define CONTROL_MOVING_LOAD_H
 
@@ -46,6 +57,7 @@ typedef struct {
     uint32_t hold_ticks_min;     /* 25 ms, periods */
     uint32_t hold_ticks_max;     /* 0.8 s */
     uint32_t release_ticks;      /* 5 ms */
+    uint32_t settling_ticks;     /* after a trigger */
     uint32_t still_reviews;      /* 0.5 s */
     int32_t movement_min_q24;    /* range of the load's estimate, N m, Q7.24 */
     uint32_t stages;             /* to withhold; 0: no detection */
@@ -66,11 +78,19 @@ typedef struct {
     uint32_t blocked;    /* periods in which nothing is withheld */
     uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
     uint32_t withheld;   /* stages */
+    bool first;          /* none had been withheld lately, and nothing has triggered since */
     moving_load_source_t source;
     uint32_t still;   /* reviews since the last movement, or since it is more than ripple, up to still_reviews */
     int32_t load_q24; /* low-pass of the estimate, N m, Q7.24 */
     int32_t load_min_q24, load_max_q24; /* its range since the last movement */
 } moving_load_t;
+
+/* All zero at the start. */
+typedef struct {
+    uint32_t q;           /* of the last sample, 0 after the last one */
+    uint32_t least;       /* of q (4 n + 1) so far */
+    uint32_t rounding_q4; /* of the last q, 2^-32 rev, Q28.4 */
+} moving_load_rounding_t;
 
 typedef struct {
     unsigned encoder_bits; /* 8..32 */
@@ -78,17 +98,25 @@ typedef struct {
     uint32_t periods_per_review;
     uint32_t stages;          /* to withhold */
     uint32_t bandwidth_rad_s; /* of the observer then, from 100 */
+    uint32_t trigger_ticks;   /* end of the first stage after a trigger, periods */
     int32_t inertia_q30;      /* kg m^2, Q1.30 */
     int32_t torque_max_q24;   /* of the drive, N m, Q7.24 */
 } moving_load_settings_t;
 
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings);
 
-/* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; angle_step: rotation
- * per period, magnitude, 2^-32 rev; from_edge: the angle was measured from the time of an edge; hold: what is withheld
- * stays withheld. 64-bit product, rounded down. */
+/* One sample: largest trend that rounding to counts causes, 2^-32 rev, Q28.4, at a rotation per period (angle_step,
+ * magnitude, 2^-32 rev), by the formula above; n rounded down to quarters. One of q = 1..6 a sample, so the result is
+ * that of up to 11 samples ago. A 32-bit division in every sixth. */
+uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, moving_load_rounding_t *rounding,
+                                 uint32_t angle_step);
+
+/* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; rounding_q4: of
+ * moving_load_rounding_q4, up to half a count; from_edge: the angle was measured from the time of an edge; triggered:
+ * the bandwidth has been triggered since the previous sample; hold: what is withheld stays withheld. 64-bit product,
+ * rounded down. */
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t angle_step, bool from_edge, bool hold);
+                          uint32_t rounding_q4, bool from_edge, bool triggered, bool hold);
 
 /* Each periods_per_review: whether the load still moves, from the estimate of the observer in N m, Q7.24; hold: what is
  * withheld stays withheld. */

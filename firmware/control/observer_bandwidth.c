@@ -5,6 +5,7 @@
 #include "fixed/fixed.h"
 
 #define LAST_STAGE (OBSERVER_BANDWIDTH_STAGES - 1)
+#define STEADY_STAGE OBSERVER_BANDWIDTH_STEADY_STAGE
 
 /* 2^32 / 2 pi: 2^-32 rev per rad. With an ideal encoder the innovation is still up to 0.3 urad: the model does not know
  * the torque between the samples. */
@@ -34,6 +35,10 @@
 #define STEADY_SHARE 128
 #define STEADY_MIN_RAD_S 100u
 
+/* 2 pi 512; a beat's rounding is a count by this. */
+#define BEAT_SHARE 3217
+#define BEAT_PARTS 24u
+
 /* Edges are frequent from one each 100 us on. */
 #define EDGE_RATE_MIN_HZ 10000u
 
@@ -59,26 +64,37 @@ static uint32_t limited_steady_rad_s(uint32_t steady_rad_s, uint64_t square) {
 static uint8_t first_stage(const observer_bandwidth_parameters_t *parameters, unsigned first, uint32_t max_rad_s,
                            uint64_t square, unsigned share) {
     unsigned stage = first;
-    while (stage < LAST_STAGE && (parameters->bandwidth_rad_s[stage] > max_rad_s ||
-                                  !within(parameters->bandwidth_rad_s[stage], square, share))) {
+    while (stage < STEADY_STAGE && (parameters->bandwidth_rad_s[stage] > max_rad_s ||
+                                    !within(parameters->bandwidth_rad_s[stage], square, share))) {
         stage++;
     }
     return (uint8_t)stage;
 }
 
+/* Narrowest one at which a count is worth the share of the torque. */
+static uint32_t beat_rad_s(uint32_t steady_rad_s, uint64_t square) {
+    uint32_t bandwidth_rad_s = steady_rad_s;
+    while (bandwidth_rad_s > STEADY_MIN_RAD_S && !within(bandwidth_rad_s - 1, square, BEAT_SHARE)) {
+        bandwidth_rad_s--;
+    }
+    return bandwidth_rad_s;
+}
+
 static void configure_stages(const observer_bandwidth_settings_t *settings, observer_bandwidth_parameters_t *parameters,
-                             uint32_t steady_rad_s) {
+                             uint32_t steady_rad_s, uint32_t last_rad_s) {
     uint32_t bandwidth_q8 = settings->transient_rad_s << 8;
     for (unsigned stage = 0; stage < OBSERVER_BANDWIDTH_STAGES; stage++) {
-        const bool last = stage == LAST_STAGE || bandwidth_q8 >> 8 <= steady_rad_s;
-        const uint32_t bandwidth_rad_s = last ? steady_rad_s : bandwidth_q8 >> 8;
+        const bool steady = stage >= STEADY_STAGE || bandwidth_q8 >> 8 <= steady_rad_s;
+        const uint32_t decayed_rad_s = steady ? steady_rad_s : bandwidth_q8 >> 8;
+        const uint32_t bandwidth_rad_s = stage == LAST_STAGE ? last_rad_s : decayed_rad_s;
         parameters->bandwidth_rad_s[stage] = (uint16_t)bandwidth_rad_s;
         parameters->gains[stage] =
             load_observer_gains(bandwidth_rad_s, settings->control_rate_hz, settings->inertia_q30);
-        /* 3.5 / t is then midway between the bandwidths of this stage and the next: t = 1.1 * 3.5 / w0. */
-        parameters->end_ticks[stage] = settings->control_rate_hz * 385u / 100u / bandwidth_rad_s;
+        /* 5 / t is then midway between the bandwidths of this stage and the next: t = 1.1 * 5 / w0. */
+        parameters->end_ticks[stage] = settings->control_rate_hz * 550u / 100u / bandwidth_rad_s;
         bandwidth_q8 = bandwidth_q8 / 16 * 13;
     }
+    parameters->end_ticks[STEADY_STAGE] = parameters->end_ticks[LAST_STAGE]; /* one step, however far */
 }
 
 observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_bandwidth_settings_t *settings) {
@@ -92,6 +108,9 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
         .threshold_count = threshold_count,
         .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
         .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, rate_hz),
+        .threshold_error = 3u * count / 8u,
+        .beat_step_min = count / 2,
+        .beat_rounding_min_q4 = 16u * count / BEAT_PARTS,
         .edge_step_min = count / (rate_hz / EDGE_RATE_MIN_HZ),
         .adaptive = adaptive,
         .trigger_stage_count = LAST_STAGE,
@@ -99,18 +118,18 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
         .steady_stage_edge = LAST_STAGE,
     };
     if (!adaptive) {
-        configure_stages(settings, &parameters, settings->steady_rad_s);
+        configure_stages(settings, &parameters, settings->steady_rad_s, settings->steady_rad_s);
         return parameters;
     }
     const uint64_t square = square_of_count(settings);
     const uint32_t steady_rad_s = limited_steady_rad_s(settings->steady_rad_s, square);
-    configure_stages(settings, &parameters, steady_rad_s);
+    configure_stages(settings, &parameters, steady_rad_s, beat_rad_s(steady_rad_s, square));
     /* Counts finer than the resolution of an edge's time are as good as edges. */
     const unsigned first = threshold_count <= THRESHOLD_EDGE ? 0 : TRIGGER_STAGE_COARSE;
     parameters.trigger_stage_count = first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
     parameters.moving_stage =
         first_stage(&parameters, parameters.trigger_stage_count, settings->moving_rad_s, square, MOVING_SHARE);
-    parameters.steady_stage_edge = LAST_STAGE - (steady_rad_s < settings->steady_rad_s);
+    parameters.steady_stage_edge = STEADY_STAGE - (steady_rad_s < settings->steady_rad_s);
     return parameters;
 }
 
@@ -159,7 +178,8 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
 
 void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
                                observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
-                               uint32_t angle_step, uint32_t withheld_stages, observer_bandwidth_limits_t *limits) {
+                               uint32_t angle_step, uint32_t rounding_q4, uint32_t withheld_stages,
+                               observer_bandwidth_limits_t *limits) {
     const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
     const bool was_steady =
         sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage >= parameters->steady_stage_edge : triggered_steady;
@@ -182,8 +202,12 @@ void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters
     statistics->holdoff_extension_q16 =
         (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
     const bool frequent_edges = sample->from_edge && angle_step >= parameters->edge_step_min;
-    const uint32_t withheld_min = frequent_edges ? LAST_STAGE - parameters->steady_stage_edge : 0;
-    limits->threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges);
+    const bool beat = !sample->from_edge && rounding_q4 >= parameters->beat_rounding_min_q4 &&
+                      angle_step >= parameters->beat_step_min;
+    const uint32_t withheld_min = frequent_edges ? LAST_STAGE - parameters->steady_stage_edge : !beat;
+    const uint32_t threshold_beat = beat ? rounding_q4 / 8 + parameters->threshold_error : 0;
+    const uint32_t threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges);
+    limits->threshold_mean = threshold_mean > threshold_beat ? threshold_mean : threshold_beat;
     limits->withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min);
     limits->trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count;
     limits->holdoff_ticks =

@@ -1,14 +1,19 @@
 /* Bandwidth scheduling of the load observer: narrow in the steady state, wide after a disturbance.
  *
- *   w0(t) = min(transient, max(steady, 3.5 / t)),   t = time since the last trigger
+ *   w0(t) = min(transient, max(steady, 5 / t)),   t = time since the last trigger
  *
  * A fixed bandwidth cannot have both a small ripple (it passes the encoder's quantisation on to speed and torque
  * reference) and a small speed drop after a load step (the load must be detected first). An innovation beyond a
  * threshold triggers the transient bandwidth, which then decays as that of an estimator which restarts with the trigger
- * and weights all samples since equally. Derived here from that estimator, the expanding-memory polynomial filter of
- * degree 2 (N. Morrison, "Introduction to Sequential Smoothing and Prediction", McGraw-Hill, 1969): its gains 9/t,
- * 36/t^2, 60/t^3 would be those of a triple pole, 3 w0, 3 w0^2, w0^3, at w0 t = 3.0, 3.46, 3.91: 3.44 in the geometric
- * mean.
+ * and weights all samples since equally: the expanding-memory polynomial filter of degree 2 (N. Morrison, "Introduction
+ * to Sequential Smoothing and Prediction", McGraw-Hill, 1969), with its gains 9/t, 36/t^2, 60/t^3. Those of a triple
+ * pole at w0 = a / t are 3 a/t, 3 a^2/t^2, a^3/t^3. What was wrong at the trigger decays then as t^s (derived here),
+ * with
+ *
+ *   (s + 3 a) (s - 1) (s - 2) + 3 a^2 (s - 2) + a^3 = 0
+ *
+ * It decays only for a > 3 + sqrt(3) = 4.73, where s = 0 is a root. With a = 3.5, which has the filter's gains in the
+ * geometric mean, s = 0.7: the error of the angle grows, and is taken for a load that moves (moving_load.h).
  *
  * The threshold depends on the resolution of the angle: 1.125 counts for the middle of a count, 8 urad where the time
  * of the last edge is known. The latter has less noise, so its transient bandwidth is wider. Edges count as such only
@@ -18,6 +23,18 @@
  * within 1 / w0 by about J w0^2 2 pi / 2^bits, which is limited to 3/5 of the largest torque after a trigger, to 1/6
  * while the load moves (moving_load.h), and to 1/20 in the steady state. Values found by trial: with twice as much, a
  * load step at 10 r/min is answered by a torque in the wrong direction.
+ *
+ * While the rotor turns by nearly a ratio p / q of counts in a period the rounding to counts is a slow sawtooth (a
+ * beat), whose rounding by moving_load.h is 1/24 count or more. No bandwidth averages it: its steps of 1 / q counts
+ * move the estimates of speed and load as far as the bandwidth is wide. So the steady bandwidth is narrower then,
+ *
+ *   J w0^2 2 pi / 2^bits = 1/512 of the largest torque,
+ *
+ * between 100 rad/s and the steady one, and the threshold is at least a step of the sawtooth, which is twice the
+ * rounding, and 3/8 count; for all q but 1 it stays 1.125 counts. Narrower still, an error of the torque's estimate
+ * moved the rotor from count to count: of an error T at any frequency the angle's is at most 0.385 T / (J w0^2), at w0
+ * / sqrt(2) (derived here). A rotor that turns by less than half a count in a period has no beat: each count tells the
+ * speed.
  *
  * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
  * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,
@@ -33,8 +50,10 @@
 
 #include "control/load_observer.h"
 
-/* Stages of the decay, each with 13/16 of the bandwidth before, the last with the steady bandwidth. */
-#define OBSERVER_BANDWIDTH_STAGES 18
+/* Stages of the decay, each with 13/16 of the bandwidth before, but for the last ones: the steady bandwidth, and that
+ * of a beat, which is withheld without one. */
+#define OBSERVER_BANDWIDTH_STAGES 19
+#define OBSERVER_BANDWIDTH_STEADY_STAGE (OBSERVER_BANDWIDTH_STAGES - 2)
 
 typedef struct {
     load_observer_gains_t gains[OBSERVER_BANDWIDTH_STAGES];
@@ -45,11 +64,14 @@ typedef struct {
     uint32_t threshold_count;         /* 2^-32 rev, for the middle of a count */
     uint32_t threshold_edge;          /* 2^-32 rev, for an angle from the time of an edge */
     int32_t mean_innovation_gain_q32; /* low-pass gain of the mean innovation per period, Q0.32 */
+    uint32_t threshold_error;         /* 2^-32 rev, besides the step of a beat */
+    uint32_t beat_step_min;           /* rotation per period from which on there are beats, 2^-32 rev */
+    uint32_t beat_rounding_min_q4;    /* rounding of a beat, 2^-32 rev, Q28.4 */
     uint32_t edge_step_min;           /* rotation per period from which edges are frequent, 2^-32 rev */
     bool adaptive;                    /* false: always the steady bandwidth */
     uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by frequent edges stage 0 */
     uint8_t moving_stage;             /* while the load moves */
-    uint8_t steady_stage_edge;        /* in the steady state with frequent edges; from counts the last one */
+    uint8_t steady_stage_edge;        /* in the steady state with frequent edges */
 } observer_bandwidth_parameters_t;
 
 /* Trigger in the last sample or samples. In the steady state it is a new event; during a decay it may belong to the
@@ -114,12 +136,14 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
 
 /* Of an adaptive bandwidth: updates the statistics with a sample after its observer_bandwidth_step, and sets the limits
  * of the next one.
- * angle_step: rotation per period, magnitude, 2^-32 rev; withheld_stages: of moving_load_step.
+ * angle_step: rotation per period, magnitude, 2^-32 rev; rounding_q4: of moving_load_rounding_q4; withheld_stages: of
+ * moving_load_step.
  * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
  * next. */
 void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
                                observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
-                               uint32_t angle_step, uint32_t withheld_stages, observer_bandwidth_limits_t *limits);
+                               uint32_t angle_step, uint32_t rounding_q4, uint32_t withheld_stages,
+                               observer_bandwidth_limits_t *limits);
 
 /* True at the steady bandwidth, always without scheduling. */
 bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage);

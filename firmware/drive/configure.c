@@ -496,6 +496,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .periods_per_review = DEFERRED_SLOW_PERIODS,
         .stages = OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage,
         .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage],
+        .trigger_ticks = control.bandwidth.end_ticks[control.bandwidth.trigger_stage_count],
         .inertia_q30 = inertia_q30,
         .torque_max_q24 = torque_max_q24,
     });
@@ -555,6 +556,9 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
     bandwidth->threshold_count = tuned->bandwidth.threshold_count;
     bandwidth->threshold_edge = tuned->bandwidth.threshold_edge;
     bandwidth->mean_innovation_gain_q32 = tuned->bandwidth.mean_innovation_gain_q32;
+    bandwidth->threshold_error = tuned->bandwidth.threshold_error;
+    bandwidth->beat_step_min = tuned->bandwidth.beat_step_min;
+    bandwidth->beat_rounding_min_q4 = tuned->bandwidth.beat_rounding_min_q4;
     bandwidth->edge_step_min = tuned->bandwidth.edge_step_min;
     bandwidth->adaptive = tuned->bandwidth.adaptive;
     bandwidth->trigger_stage_count = tuned->bandwidth.trigger_stage_count;

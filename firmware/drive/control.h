@@ -143,6 +143,7 @@ typedef struct {
     protection_deferred_t protection;
     observer_bandwidth_statistics_t bandwidth;
     moving_load_t moving_load;
+    moving_load_rounding_t rounding;
     torque_offset_t torque_offset;
     periodic_load_t periodic_load;
     bool run;                    /* in the last input */

@@ -147,15 +147,18 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
                             observer_bandwidth_limits_t *limits) {
     const observer_bandwidth_sample_t *sample = &input->bandwidth;
     const uint32_t angle_step = fixed_magnitude(rotation(parameters, input));
-    const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation,
-                                               angle_step, sample->from_edge, deferred->periodic_load.engaged);
-    observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, withheld, limits);
+    const uint32_t rounding_q4 = moving_load_rounding_q4(&parameters->moving_load, &deferred->rounding, angle_step);
+    const uint32_t withheld =
+        moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation, rounding_q4,
+                         sample->from_edge, sample->trigger != OBSERVER_TRIGGER_NONE, deferred->periodic_load.engaged);
+    observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, rounding_q4, withheld,
+                              limits);
 }
 
 /* Between slow counts there is nothing of which statistics could be made. */
 NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                         const deferred_input_t *input, deferred_results_t *results) {
-    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 0,
+    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 1,
                                                        parameters->bandwidth.trigger_stage_count};
     if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
                           fixed_magnitude(rotation(parameters, input)), input->periods)) {

@@ -42,7 +42,7 @@ NOINLINE void observe_recover(control_state_t *state, const control_measurement_
 NOINLINE static const load_observer_gains_t *slow_gains(const control_parameters_t *parameters, control_state_t *state,
                                                         const slow_counts_results_t *slow_counts,
                                                         const control_measurement_t *measured) {
-    state->bandwidth.stage = OBSERVER_BANDWIDTH_STAGES - 1u;
+    state->bandwidth.stage = OBSERVER_BANDWIDTH_STEADY_STAGE;
     return slow_counts_gains(&parameters->slow_counts, slow_counts, measured->encoder_angle);
 }
 

@@ -98,7 +98,7 @@ MACHINES = {
     "linear_cosine": Metrics((0.068, 0.0705), (2.9, 3.6), (0.0026, 0.0033), (0.005, 0.0100), (0.003, 0.0065)),
     "linear_trapezoid": Metrics((0.068, 0.0705), (3.2, 3.8), (0.0028, 0.0036), (0.004, 0.0100), (0.0025, 0.0065)),
     # A fifth of the inertia, and a converter with minimum pulses and device drops that the drive does not model.
-    "finite_element": Metrics((0.0142, 0.0152), (8.8, 10.0), (0.0033, 0.0043), (0.010, 0.022), (0.0045, 0.0095)),
+    "finite_element": Metrics((0.0142, 0.0152), (8.8, 10.0), (0.0022, 0.003), (0.010, 0.022), (0.0045, 0.0095)),
 }
 
 
@@ -225,7 +225,7 @@ def test_encoder_misalignment_is_learned_and_the_ripple_falls(run_recorded, offs
 
     early, _ = ripple(0.16, 0.2)
     after_a_second, bench = ripple(0.9, 1.0)
-    assert within((0.24, 0.33), misalignment_deg(bench) * np.sign(offset_deg))  # on its way
+    assert within((0.22, 0.33), misalignment_deg(bench) * np.sign(offset_deg))  # on its way
     late, bench = ripple(3.9, 4.0)
     assert within((0.27, 0.305), misalignment_deg(bench) * np.sign(offset_deg))
     assert within((0.03, 0.11), early)  # takes the ripple for a load that moves, with a wide bandwidth
@@ -273,7 +273,9 @@ def test_observer_bandwidth_stays_narrow_in_steady_state(make_bench, inertia_gai
     bandwidth = bench.telemetry["DRIVE_TRIM.observer_bandwidth_rad_s"]
     assert bandwidth.between(0.0, 0.2).value.max() > 1000  # the load step raised it
     steady = bench.drive.parameters["observer_steady_rad_s"]
-    assert set(bandwidth.between(1.0, 2.0).value) == {steady}
+    narrow = bandwidth.between(1.0, 2.0).value
+    assert max(narrow) == min(narrow) <= steady  # less with 14 bits, which are 1.02 counts in a period
+    assert min(narrow) >= 100
     speed_rpm = bench.truth["speed_rpm"].between(1.0, 2.0).value
     assert 149.9 < speed_rpm.min() < speed_rpm.max() < 150.1
 

@@ -21,6 +21,7 @@ constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
 constexpr uint32_t RATE_HZ = 40000;
 const int32_t INERTIA_Q30 = to_fixed(INERTIA, Q30);
 constexpr unsigned LAST_STAGE = OBSERVER_BANDWIDTH_STAGES - 1;
+constexpr unsigned STEADY_STAGE = OBSERVER_BANDWIDTH_STEADY_STAGE;
 
 observer_bandwidth_parameters_t configure(uint32_t transient_rad_s = TRANSIENT_RAD_S, uint32_t rate_hz = RATE_HZ,
                                           unsigned encoder_bits = ENCODER_BITS) {
@@ -41,6 +42,7 @@ class Bandwidth {
     explicit Bandwidth(const observer_bandwidth_parameters_t &p, double rate_hz = RATE_HZ)
         : parameters(p), model(reference_model::model_of(p, rate_hz)) {
         observer_bandwidth_reset(&state);
+        limits.withheld_stages = 1; // no beat
         limits.holdoff_ticks = p.retrigger_holdoff_ticks;
     }
 
@@ -62,7 +64,7 @@ class Bandwidth {
     void update(int32_t innovation, bool from_edge) {
         const observer_bandwidth_sample_t sample = {
             .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
-        observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, 0, &limits);
+        observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, rounding_q4, 0, &limits);
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 
@@ -81,12 +83,12 @@ class Bandwidth {
     observer_bandwidth_limits_t limits{};
     observer_bandwidth_statistics_t statistics{};
     bool updating = true; // the statistics, with every sample
-    uint32_t angle_step = COUNT;
+    uint32_t angle_step = COUNT, rounding_q4 = 0;
     reference_model::bandwidth_t model;
     unsigned triggers = 0;
 };
 
-TEST(ObserverBandwidth, decays_as_3_5_over_time_within_11_percent_from_the_transient_to_the_steady_bandwidth) {
+TEST(ObserverBandwidth, decays_as_5_over_time_within_11_percent_from_the_transient_to_the_steady_bandwidth) {
     for (const uint32_t rate_hz : {20000u, 40000u, 50000u, 100000u, 1000000u}) {
         Bandwidth bandwidth(configure(TRANSIENT_RAD_S, rate_hz), rate_hz);
         EXPECT_EQ(bandwidth.rad_s(), TRANSIENT_RAD_S) << "transient at the start";
@@ -116,7 +118,7 @@ TEST(ObserverBandwidth, every_stage_has_the_gains_of_its_bandwidth) {
         EXPECT_EQ(p.gains[stage].speed_gain_q24, gains.speed_gain_q24);
         EXPECT_EQ(p.gains[stage].load_gain_q28, gains.load_gain_q28);
         EXPECT_EQ(p.gains[stage].load_factor_q4, gains.load_factor_q4);
-        if (stage > 0 && stage < LAST_STAGE) {
+        if (stage > 0 && stage < STEADY_STAGE) {
             EXPECT_NEAR(p.bandwidth_rad_s[stage], p.bandwidth_rad_s[stage - 1] * 13.0 / 16.0, 2.0);
             EXPECT_GT(p.end_ticks[stage], p.end_ticks[stage - 1]);
         }
@@ -125,12 +127,12 @@ TEST(ObserverBandwidth, every_stage_has_the_gains_of_its_bandwidth) {
 
 TEST(ObserverBandwidth, a_narrow_schedule_ends_early_and_stays_at_the_steady_bandwidth) {
     const observer_bandwidth_parameters_t p = configure(STEADY_RAD_S * 2);
-    for (unsigned stage = 0; stage < OBSERVER_BANDWIDTH_STAGES; stage++) {
+    for (unsigned stage = 0; stage < LAST_STAGE; stage++) {
         EXPECT_GE(p.bandwidth_rad_s[stage], STEADY_RAD_S);
     }
     EXPECT_EQ(p.bandwidth_rad_s[0], STEADY_RAD_S * 2);
     EXPECT_EQ(p.bandwidth_rad_s[4], STEADY_RAD_S);
-    EXPECT_EQ(p.bandwidth_rad_s[LAST_STAGE], STEADY_RAD_S);
+    EXPECT_EQ(p.bandwidth_rad_s[STEADY_STAGE], STEADY_RAD_S);
 }
 
 TEST(ObserverBandwidth, an_innovation_above_1_25_counts_or_8_urad_of_an_edge_triggers_and_a_smaller_one_does_not) {
@@ -255,11 +257,11 @@ TEST(ObserverBandwidth, no_stage_is_wider_than_the_encoder_allows_and_the_next_w
         const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, bits);
         const auto largest_Nm = [&](unsigned stage) { return count_Nm(p.bandwidth_rad_s[stage], bits); };
         const unsigned trigger = p.trigger_stage_count, moving = p.moving_stage;
-        const unsigned steady_rad_s = p.bandwidth_rad_s[LAST_STAGE];
+        const unsigned steady_rad_s = p.bandwidth_rad_s[STEADY_STAGE];
         EXPECT_LE(trigger, moving);
-        EXPECT_TRUE(trigger == LAST_STAGE || largest_Nm(trigger) <= TORQUE_MAX_NM * 0.63) << bits;
+        EXPECT_TRUE(trigger == STEADY_STAGE || largest_Nm(trigger) <= TORQUE_MAX_NM * 0.63) << bits;
         EXPECT_GT(largest_Nm(trigger - 1), TORQUE_MAX_NM * 0.62) << bits;
-        EXPECT_TRUE(moving == LAST_STAGE || largest_Nm(moving) <= TORQUE_MAX_NM * 0.16) << bits;
+        EXPECT_TRUE(moving == STEADY_STAGE || largest_Nm(moving) <= TORQUE_MAX_NM * 0.16) << bits;
         EXPECT_TRUE(steady_rad_s == 100 || count_Nm(steady_rad_s, bits) <= TORQUE_MAX_NM * 0.05) << bits;
         EXPECT_TRUE(steady_rad_s == STEADY_RAD_S || count_Nm(steady_rad_s + 1, bits) > TORQUE_MAX_NM * 0.049) << bits;
     }
@@ -268,8 +270,8 @@ TEST(ObserverBandwidth, no_stage_is_wider_than_the_encoder_allows_and_the_next_w
 TEST(ObserverBandwidth, a_fine_encoder_keeps_the_bandwidths_of_the_settings) {
     const observer_bandwidth_parameters_t p = configure();
     EXPECT_EQ(configure(TRANSIENT_RAD_S, RATE_HZ, 19).trigger_stage_count, 3) << "coarser than edges";
-    EXPECT_EQ(p.bandwidth_rad_s[LAST_STAGE], STEADY_RAD_S);
-    EXPECT_EQ(p.steady_stage_edge, LAST_STAGE);
+    EXPECT_EQ(p.bandwidth_rad_s[STEADY_STAGE], STEADY_RAD_S);
+    EXPECT_EQ(p.steady_stage_edge, STEADY_STAGE);
     EXPECT_LE(p.bandwidth_rad_s[p.moving_stage], MOVING_RAD_S);
     EXPECT_GT(p.bandwidth_rad_s[p.moving_stage - 1], MOVING_RAD_S);
 }
@@ -303,10 +305,86 @@ TEST(ObserverBandwidth, rare_edges_of_a_coarse_encoder_count_as_counts_and_frequ
         for (uint32_t k = 0; k < RATE_HZ; k++) {
             bandwidth.step(0, true);
         }
-        EXPECT_EQ(bandwidth.state.stage, frequent ? p.steady_stage_edge : LAST_STAGE);
+        EXPECT_EQ(bandwidth.state.stage, frequent ? p.steady_stage_edge : STEADY_STAGE);
         EXPECT_EQ(bandwidth.step(int32_t(count), true), frequent);
         EXPECT_EQ(bandwidth.limits.trigger_stage_edge, frequent ? 0 : p.trigger_stage_count);
     }
+}
+
+// A rotation per period of `counts`, with the rounding of moving_load.h as a part of a count.
+double rad_s_after_a_second(unsigned bits, double counts, double rounding, bool from_edge) {
+    Bandwidth bandwidth(configure(TRANSIENT_RAD_S, RATE_HZ, bits));
+    const double count = std::ldexp(1.0, int(32 - bits));
+    bandwidth.angle_step = uint32_t(counts * count);
+    bandwidth.rounding_q4 = uint32_t(16.0 * rounding * count);
+    for (uint32_t k = 0; k < RATE_HZ; k++) {
+        bandwidth.step(0, from_edge);
+    }
+    EXPECT_TRUE(bandwidth.steady());
+    return bandwidth.rad_s();
+}
+
+TEST(ObserverBandwidth, a_beat_of_the_rounding_narrows_the_steady_bandwidth_and_nothing_else_does) {
+    const double beat_rad_s = configure(TRANSIENT_RAD_S, RATE_HZ, 15).bandwidth_rad_s[LAST_STAGE];
+    EXPECT_LT(beat_rad_s, STEADY_RAD_S * 0.6);
+    EXPECT_EQ(rad_s_after_a_second(15, 3.0, 0.5, false), beat_rad_s);
+    EXPECT_EQ(rad_s_after_a_second(15, 3.0, 1.0 / 23.0, false), beat_rad_s);
+    EXPECT_EQ(rad_s_after_a_second(15, 3.0, 1.0 / 25.0, false), STEADY_RAD_S) << "fast enough";
+    EXPECT_EQ(rad_s_after_a_second(15, 0.51, 0.5, false), beat_rad_s);
+    EXPECT_EQ(rad_s_after_a_second(15, 0.49, 0.5, false), STEADY_RAD_S) << "less than half a count in a period";
+    EXPECT_EQ(rad_s_after_a_second(15, 3.0, 0.5, true), STEADY_RAD_S) << "edges";
+}
+
+TEST(ObserverBandwidth, in_a_beat_a_count_is_worth_at_least_a_512th_of_the_torque) {
+    for (unsigned bits = 8; bits <= 32; bits++) {
+        const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, bits);
+        const unsigned beat_rad_s = p.bandwidth_rad_s[LAST_STAGE], steady_rad_s = p.bandwidth_rad_s[STEADY_STAGE];
+        EXPECT_LE(beat_rad_s, steady_rad_s) << bits;
+        EXPECT_GE(beat_rad_s, 100u) << bits;
+        if (beat_rad_s < steady_rad_s) {
+            EXPECT_GT(count_Nm(beat_rad_s, bits), TORQUE_MAX_NM / 513.0) << bits;
+        }
+        EXPECT_TRUE(beat_rad_s == 100 || count_Nm(beat_rad_s - 1, bits) <= TORQUE_MAX_NM / 511.0) << bits;
+    }
+}
+
+TEST(ObserverBandwidth, a_trigger_ends_the_bandwidth_of_a_beat_and_the_decay_returns_to_it) {
+    const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, 14);
+    Bandwidth bandwidth(p);
+    bandwidth.angle_step = 1u << 18;
+    bandwidth.rounding_q4 = 8u << 18;
+    for (uint32_t k = 0; k < RATE_HZ / 5; k++) {
+        bandwidth.step(0);
+    }
+    ASSERT_EQ(bandwidth.state.stage, LAST_STAGE);
+    EXPECT_TRUE(bandwidth.step(2 << 18));
+    EXPECT_EQ(bandwidth.state.stage, p.trigger_stage_count);
+    uint32_t periods = 0;
+    while (bandwidth.state.stage < LAST_STAGE) {
+        bandwidth.step(0);
+        ASSERT_LT(++periods, RATE_HZ);
+    }
+    EXPECT_NEAR(periods / double(RATE_HZ), 5.5 / p.bandwidth_rad_s[LAST_STAGE], 1e-3);
+}
+
+// Error of a schedule a / t: d(angle) = w - 3 w0 e, dw = L - 3 w0^2 e, dL = -w0^3 e, with the load step at t = 1.2 ms.
+double error_growth(double a) {
+    double e = 0.0, w = 0.0, load = 1.0, first = 0.0;
+    constexpr double STEP_S = 1e-7;
+    for (double t = 1.2e-3; t < 25e-3; t += STEP_S) {
+        const double w0 = a / t;
+        const double de = w - 3.0 * w0 * e, dw = load - 3.0 * w0 * w0 * e, dload = -w0 * w0 * w0 * e;
+        e += de * STEP_S;
+        w += dw * STEP_S;
+        load += dload * STEP_S;
+        first = t < 6e-3 ? e : first;
+    }
+    return std::fabs(e / first);
+}
+
+TEST(ObserverBandwidth, a_decay_as_5_over_time_forgets_the_load_step_and_one_as_3_5_over_time_does_not) {
+    EXPECT_LT(error_growth(5.0), 0.9);
+    EXPECT_GT(error_growth(3.5), 2.0);
 }
 
 } // namespace

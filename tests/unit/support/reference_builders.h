@@ -46,7 +46,8 @@ inline observer_t model_of(const load_observer_gains_t &gains, const load_observ
 
 inline bandwidth_t model_of(const observer_bandwidth_parameters_t &p, double rate_hz) {
     bandwidth_t bandwidth{};
-    bandwidth.steady_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
+    bandwidth.steady_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STEADY_STAGE];
+    bandwidth.beat_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
     bandwidth.count_trigger_rad_s = p.bandwidth_rad_s[p.trigger_stage_count];
     bandwidth.edge_trigger_rad_s = p.bandwidth_rad_s[0];
     bandwidth.rate_hz = rate_hz;
@@ -64,6 +65,7 @@ inline moving_load_t model_of(const moving_load_parameters_t &p, bool edges, dou
     moving.threshold = (edges ? 7656.0 : p.threshold_count_q4) / 16.0 / fixed_point::REV;
     moving.implausible = p.implausible_q4 / 16.0 / fixed_point::REV;
     moving.stages = p.stages;
+    moving.settling_s = p.settling_ticks / rate_hz;
     return moving;
 }
 

@@ -94,26 +94,41 @@ struct observer_t {
     }
 };
 
+// Largest trend that rounding causes in a low-pass, in counts: the sawtooth of q samples has 1 / (2 q) counts.
+inline double rounding_counts(double counts_per_period, double time_constant_periods) {
+    double most = 0.0;
+    for (int q = 1; q <= 6; q++) {
+        const double distance = std::fabs(q * counts_per_period - std::round(q * counts_per_period));
+        most = std::max(most, 0.5 / q / (1.0 + std::floor(4.0 * distance * time_constant_periods)));
+    }
+    return most;
+}
+
 // Trend of the innovation, in revolutions: stages of the bandwidth that are withheld while the load moves.
 struct moving_load_t {
     double rate_hz, threshold, implausible;
     unsigned stages;
+    double settling_s; // after a trigger
     double time_constant_s = 1.6e-3, hold_min_s = 0.05, hold_max_s = 0.8, release_s = 0.005, blocked_s = 1.0;
-    double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, blocked_until_s = 0.0, time_s = 0.0;
+    double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, blocked_until_s = 0.0, settled_s = 0.0, time_s = 0.0;
     unsigned withheld = 0;
 
-    unsigned step(double innovation) {
-        const double magnitude = std::fabs(trend);
+    // rounding: added to the threshold.
+    unsigned step(double innovation, double rounding, bool triggered) {
+        const double magnitude = time_s < settled_s ? 0.0 : std::fabs(trend);
         time_s += 1.0 / rate_hz;
         remaining_s -= 1.0 / rate_hz;
         trend += (innovation - trend) / (time_constant_s * rate_hz);
         if (time_s < blocked_until_s) {
             return 0;
         }
+        if (triggered) {
+            settled_s = time_s + settling_s;
+        }
         if (magnitude > implausible && withheld > 0) {
             withheld = 0;
             blocked_until_s = time_s + blocked_s;
-        } else if (magnitude > threshold) {
+        } else if (magnitude > threshold + rounding) {
             hold_s = std::clamp(withheld == stages ? hold_s : 2.0 * hold_s, hold_min_s, hold_max_s);
             withheld = stages;
             remaining_s = hold_s;
@@ -128,10 +143,10 @@ struct moving_load_t {
     }
 };
 
-// Bandwidth schedule of the load observer: 3.5 / t since the last trigger, between steady and transient bandwidth.
+// Bandwidth schedule of the load observer: 5 / t since the last trigger, between steady and transient bandwidth.
 // Angles in revolutions. The thresholds are those of the firmware.
 struct bandwidth_t {
-    double steady_rad_s, count_trigger_rad_s, edge_trigger_rad_s, rate_hz;
+    double steady_rad_s, beat_rad_s, count_trigger_rad_s, edge_trigger_rad_s, rate_hz;
     double threshold_count, threshold_edge;
     double holdoff_s, holdoff_decay; // minimum hold-off; decay factor of its extension per period
     double bandwidth_rad_s = 0.0;    // 0 before the first step, which is transient
@@ -140,14 +155,15 @@ struct bandwidth_t {
 
     bool steady() const { return bandwidth_rad_s <= steady_rad_s; }
 
-    // least_rad_s: while the load moves.
-    double step(double innovation, bool from_edge, double least_rad_s = 0.0) {
+    // least_rad_s: while the load moves; beat: the rotation per period is nearly a ratio of counts.
+    double step(double innovation, bool from_edge, double least_rad_s = 0.0, bool beat = false) {
         const double transient_rad_s = edge_trigger_rad_s;
         since_s += 1.0 / rate_hz;
         if (bandwidth_rad_s == 0.0) {
             start_rad_s = transient_rad_s;
         }
-        bandwidth_rad_s = std::max(std::min(start_rad_s, 3.5 / since_s), std::max(steady_rad_s, least_rad_s));
+        bandwidth_rad_s =
+            std::max(std::min(start_rad_s, 5.0 / since_s), std::max(beat ? beat_rad_s : steady_rad_s, least_rad_s));
         const double threshold = std::max(4.0 * mean_innovation, from_edge ? threshold_edge : threshold_count);
         const double magnitude = std::fabs(innovation);
         if (steady()) {

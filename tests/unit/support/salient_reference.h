@@ -150,8 +150,14 @@ class salient_t {
             torque += machine.torque(angle[phase], current);
         }
         const double innovation = observer.innovation(measured);
-        const double now_rad_s = bandwidth.step(innovation, from_edge, least_rad_s);
-        const unsigned withheld = moving_load[from_edge].step(innovation); // acts in the next period
+        const unsigned triggers = bandwidth.triggers;
+        const double now_rad_s = bandwidth.step(innovation, from_edge, least_rad_s, beat);
+        const double counts = std::ldexp(std::fabs(observer.speed * observer.angle_step), int(encoder_bits));
+        const double rounding = from_edge ? 0.0 : rounding_counts(counts, moving_load[0].time_constant_s * rate_hz);
+        // These act in the next period.
+        beat = rounding >= 1.0 / 24.0 && counts >= 0.5;
+        const unsigned withheld = moving_load[from_edge].step(innovation, std::ldexp(rounding, -int(encoder_bits)),
+                                                              bandwidth.triggers > triggers);
         least_rad_s = withheld > 0 ? stage_rad_s[OBSERVER_BANDWIDTH_STAGES - 1 - withheld] : 0.0;
         observer.set_gains(observer_of(now_rad_s));
         observer.step(measured, torque);
@@ -208,7 +214,7 @@ class salient_t {
     unsigned encoder_bits;
     double current_count, voltage_count; // value of a count
     double epsilon, delta, gain, torque_max;
-    bool initialised = false;
+    bool initialised = false, beat = false;
     unsigned turn = 0;
     double reaching = 0.0; // acts in the next period
     observer_t observer{};
