@@ -74,8 +74,7 @@ def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
         salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold",
                                                 "torque_speed_random", "partial_torque", "copper", "copper_random",
-                                                "transition",
-                                                "torque_conditions")}
+                                                "transition", "torque_conditions", "every_speed")}
         expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},
                     "compressor": {"paper", "salient"}}
         assert {case.controller for case in of} == (expected | salient).get(name, set(CONTROLLERS))
@@ -438,8 +437,9 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
     for name, of in ALL_CASES.items():
         if name == "machines" or name in speed_range.GROUPS:  # of its own
             continue
-        own = [case for case in of if case.scenario.machine == "saturating"]
-        for case, scaled in zip(own, cases_of(of, on), strict=True):
+        own = [case for case in of if case.scenario.machine == "saturating" and case.extractor != "counts"]
+        of_machine = [case for case in cases_of(of, on) if case.extractor != "counts"]
+        for case, scaled in zip(own, of_machine, strict=True):
             assert scaled.scenario.machine == on.path and "saturating" not in scaled.condition
             assert (scaled.group, scaled.sample, scaled.extractor) == (name, case.sample, case.extractor)
             assert [step.value_rpm for step in scaled.scenario.speed] == [
@@ -447,6 +447,36 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
             assert [step.torque_Nm for step in scaled.scenario.load] == [
                 scale.Nm(step.torque_Nm) for step in case.scenario.load]
             assert scaled.scenario.record.from_s <= scaled.scenario.duration_s
+
+
+def test_speeds_are_near_and_far_from_ratios_of_counts_with_all_resolutions_and_rates():
+    cases = ALL_CASES["every_speed"]
+    assert len(cases) == 2016 and len({case.scenario.machine for case in cases}) == 8
+    assert {case.scenario.encoder_bits for case in cases} == set(range(10, 19))
+    assert {case.scenario.control_rate_hz for case in cases} == {20_000, 40_000, 50_000, 100_000}
+    beats_hz = []
+    of_machine = {machine: derive(load_machine(machine_path(machine)))
+                  for machine in {case.scenario.machine for case in cases}}
+    for case in cases:
+        scenario = case.scenario
+        data = of_machine[scenario.machine]
+        speed_rpm = scenario.speed[0].value_rpm
+        assert 0.015 * data.speed_base_rpm <= speed_rpm <= 1.0001 * data.speed_base_rpm
+        assert scenario.load[0].torque_Nm == pytest.approx(0.5 * data.torque_rated_Nm)
+        counts = speed_rpm / 60.0 * 2**scenario.encoder_bits / scenario.control_rate_hz
+        beats_hz.append(min(abs(q * counts - max(1, round(q * counts))) for q in (1, 2, 3, 4, 5))
+                        * scenario.control_rate_hz)
+    assert 0.3 < np.mean(np.array(beats_hz) < 1000.0) < 0.6
+
+
+def test_the_worst_runs_are_named_and_the_spread_is_relative_to_the_median():
+    runs = [run_metrics("salient", sample, group="speeds", ripple_step=value)
+            for sample, value in (("a", 0.01), ("b", 0.03), ("c", 0.02))]
+    (spread,) = (row for row in table.make_rows(runs) if row.key[3] == "spread")
+    assert spread.values["salient"] == pytest.approx(1.5)
+    assert spread.label == "max. over median of K_t from 20 ms after a load step"
+    assert [line.split()[-1] for line in table.worst(runs)[1:]] == ["b", "c", "a"]
+    assert table.worst([run_metrics()]) == []
 
 
 def test_another_machine_has_its_own_runs_among_machines_of_all_sizes():
@@ -759,7 +789,7 @@ def test_drive_follows_moving_loads(tmp_path):
     code, output = compare("moving", "ramps", "--quick", "--out", tmp_path)
     assert code == 0 and "6 of 6 targets reached" in output
     content = json.loads((tmp_path / "compare.json").read_text())
-    values = {row["condition"]: row["values"] for row in content["rows"]}
+    values = {row["condition"]: row["values"] for row in content["rows"] if row["figure"] != "swing_of_free"}
     for condition, controller, low_rpm, high_rpm in (
         ("saturating, 150 r/min, 5 Hz", "salient", 0.3, 0.7), ("saturating, 150 r/min, 5 Hz", "paper", 0.6, 0.9),
         ("saturating, 150 r/min, 20 Hz", "traditional", 9.0, 13.0), ("saturating, 20 ms", "salient", 0.3, 0.8),
@@ -792,8 +822,8 @@ def test_groups_are_listed():
     assert code == 0
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
     assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
-        "torque_speed_random", "partial_torque", "copper_random", "transition", "torque_conditions", "encoders", "misalignment",
-        "standing_error", "hold", "ablation", "robustness", "machines"]
+        "every_speed", "torque_speed_random", "partial_torque", "copper_random", "transition", "torque_conditions",
+        "encoders", "misalignment", "standing_error", "hold", "ablation", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():

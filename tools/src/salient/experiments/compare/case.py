@@ -45,14 +45,16 @@ class Group:
     """A part of the comparison.
 
     columns: (metric, statistic) of its rows, as far as its runs have them. The statistic is "" for a single run, else
-    median, worst (maximum), gap (widest between angles, modulo STROKE_DEG) or count (of failed runs). long: runs only
-    when named. ratios: metric -> its quotient by that of the first sample with the same extractor, a metric of its own.
+    median, worst (maximum), spread (maximum over median), gap (widest between angles, modulo STROKE_DEG) or count (of
+    failed runs). long: runs only when named. worst: metrics of which the ten worst runs are named below the table.
+    ratios: metric -> its quotient by that of the first sample with the same extractor, a metric of its own.
     """
 
     title: str
     cases: Callable[[bool], Iterator[Case]]
     columns: tuple[tuple[str, str], ...]
     long: bool = False
+    worst: tuple[str, ...] = ()
     ratios: Mapping[str, str] = field(default_factory=dict)
 
 

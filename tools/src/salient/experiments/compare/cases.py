@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from salient.config import CONDITIONS, CONTROLLERS
-from salient.experiments.compare import every_machine, random_cases, range_cases, speed_range
+from salient.experiments.compare import count_cases, every_machine, random_cases, range_cases, speed_range
 from salient.experiments.compare.case import (
     LOAD_NM,
     MACHINES,
@@ -48,6 +48,8 @@ LATE_S = 3.0
 MOVING_MACHINES = ("saturating", "finite_element")
 SINE_NM = 4.0
 SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
+FAST_SINES_HZ = (150.0, 200.0, 300.0, 500.0)
+"""Of `salient` only."""
 SINE_WINDOW_S = 0.15
 """Two periods of the load where they are longer."""
 RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)
@@ -113,6 +115,7 @@ def _speeds(quick: bool) -> Iterator[Case]:
             condition = f"{machine}{f' with {_pulses(pulses)}' if pulses else ''}, {speed_rpm:g} r/min"
             yield from _steady("speeds", condition, speed_rpm, loaded_s + 0.5, quick, loaded_s=loaded_s,
                              machine=machine, pulses=pulses)
+    yield from count_cases.sampled(quick)
 
 
 def _loads(quick: bool) -> Iterator[Case]:
@@ -151,6 +154,7 @@ def _moving(quick: bool) -> Iterator[Case]:
     if not quick:
         conditions += [(speed_rpm, frequency_Hz, ("salient",)) for speed_rpm in (30.0, 600.0, 1500.0)
                        for frequency_Hz in (1.0, 20.0)]
+        conditions += [(RIPPLE_RPM, frequency_Hz, ("salient",)) for frequency_Hz in FAST_SINES_HZ]
     for machine in MOVING_MACHINES[:1] if quick else MOVING_MACHINES:
         for speed_rpm, frequency_Hz, controllers in conditions:
             scenario = _sine_scenario(speed_rpm, frequency_Hz, machine=machine)
@@ -236,17 +240,25 @@ def _machines(quick: bool) -> Iterator[Case]:
         yield from speed_range.of_any_machine(quick, str(path))
 
 
+_STEP_RIPPLE = (("ripple_step", "median"), ("ripple_step", "worst"), ("ripple_step", "spread"),
+                ("speed_dip_rpm", "median"))
+
 GROUPS: dict[str, Group] = {
     "ripple": Group("torque ripple at 150 r/min, 8 N m", _ripple, (("ripple", ""), ("ripple_long", ""))),
-    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz", _speeds,
-                    (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""))),
+    "speeds": Group("torque ripple over speed, 8 N m, 40 kHz; load steps of half the rated torque at speeds near and"
+                    " far from ratios of counts in a control period, 20 to 100 kHz", _speeds,
+                    (("ripple", ""), ("ripple_long", ""), ("speed_error_percent", ""), *_STEP_RIPPLE),
+                    worst=("ripple_step",)),
+    "every_speed": Group("the same load steps at 2,016 speeds of eight machines, 10 to 18 bits", count_cases.every,
+                         _STEP_RIPPLE, long=True, worst=("ripple_step",)),
     "loads": Group("torque ripple over load, 150 r/min, 40 kHz", _loads,
                    (("ripple", ""), ("ripple_long", ""))),
     "start": Group("start to 600 r/min, no load, 40 kHz", _start, (("settling_time_s", ""), ("overshoot_percent", ""))),
     "dip": Group("load step of 8 N m at 150 r/min, over the rotor's angle, 40 kHz", _dip,
                  (("speed_dip_rpm", "median"), ("speed_dip_rpm", "worst"), ("recovery_time_s", "median"),
                   ("speed_after_rpm", "worst"), ("copper_W", "median"), ("step_angle_deg", "gap"))),
-    "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving, (("speed_swing_rpm", ""),)),
+    "moving": Group("load of 8 N m and a sine of 4 N m, 40 kHz", _moving,
+                    (("speed_swing_rpm", ""), ("swing_of_free", ""))),
     "ramps": Group("load ramp to 8 N m at 150 r/min, 40 kHz", _ramps, (("speed_dip_rpm", ""),)),
     "torque_speed": Group("largest torque over the speed of a held shaft, 0.25 to 2 times the base speed, 40 kHz",
                           speed_range.torque_speed,

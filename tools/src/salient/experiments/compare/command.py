@@ -58,6 +58,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 
     write_page(options.out / PAGE, rows, content, change_summary, changes, _command(options), titles)
     stream.write(f"{table.table(rows, titles)}\n\n{table.summary(rows)}\n")
+    stream.writelines(f"{line}\n" for line in table.worst(runs))
     for run, path in failed[:_FAILED_LISTED_MAX]:
         stream.write(f"{_name(run.case)}: {run.failed}; reproduce with: {COMMAND} run {path}\n")
     if len(failed) > _FAILED_LISTED_MAX:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from salient.bench.rig import bench_variables
-from salient.experiments.compare import every_machine, speed_range
+from salient.experiments.compare import count_cases, every_machine, speed_range
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG
 from salient.experiments.compare.targets import TARGETS, Key, Target
@@ -78,12 +78,12 @@ def _allowed(scenario: Scenario) -> bool:
 
 def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Case]:
     """The cases of the paper's machine among `cases`, for another machine, and its own runs of the groups `machines`
-    and those of speed_range.py."""
+    and those of speed_range.py and count_cases.py."""
     of_paper, sized = [], {}
     groups: dict[str, None] = {}
     for case in cases:
         groups[case.group] = None  # in order
-        if case.group in speed_range.GROUPS:
+        if case.group in speed_range.GROUPS or case.extractor == count_cases.EXTRACTOR:
             continue
         if case.scenario.machine == PAPER:
             own_case = _case(case, on)
@@ -92,8 +92,8 @@ def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Ca
         elif case.extractor == "every_machine":
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
                 machine_path(on.path), case.controller))
-    own = [case for group in groups if group in speed_range.GROUPS
-           for case in speed_range.GROUPS[group](quick, (on.path,))]
+    generators = {**speed_range.GROUPS, **count_cases.GROUPS}
+    own = [case for group in groups if group in generators for case in generators[group](quick, (on.path,))]
     if sized:
         own += speed_range.of_any_machine(quick, on.path)
     return [*of_paper, *sized.values(), *own]

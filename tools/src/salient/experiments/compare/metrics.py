@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.experiments import metrics
-from salient.experiments.compare import every_machine, speed_range
+from salient.experiments.compare import count_cases, every_machine, speed_range
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
@@ -79,6 +79,7 @@ METRICS = {
     "ripple_long": Metric("K_t over 1 s", "", 5, 0.0002),
     "ripple_reference": Metric("K_t of the reference model", "", 5, 0.0002),
     "ripple_to_allowed": Metric("K_t", "of 0.010 or 1.2 times that", 3, 0.02),
+    "ripple_step": Metric("K_t from 20 ms after a load step", "", 5, 0.0002),
     "ripple_late": Metric("K_t after 3 s", "", 5, 0.0002),
     "speed_error_percent": Metric("speed error", "%", 3, 0.01),
     "settling_time_s": Metric("settling time to 0.5 %", "s", 5, 0.0001),
@@ -121,6 +122,7 @@ METRICS = {
     "mean_error_percent": Metric("error of the mean speed", "%", 3, 0.01),
     "deviation_rpm": Metric("deviation under a constant load beyond 0.5 %", "r/min", 2, 0.02),
     "swing_ratio": Metric("swing under a sine relative to the free shaft", "", 3, 0.01),
+    "swing_of_free": Metric("peak-to-peak speed relative to the free shaft", "", 3, 0.01),
     "drift_deg": Metric("movement of the shaft", "deg", 4, 0.001),
     "step_angle_deg": Metric("rotor angle at the step", "deg", 2, 0.2),
 }
@@ -170,9 +172,19 @@ def load_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Windo
     return {**values, "step_angle_deg": float(recording["rotor_angle_deg"][at_step]) % stroke_deg}
 
 
+def counts_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """The largest ripple of count_cases.windows_s, and the drop of the speed before them."""
+    dip_rpm = metrics.speed_after_step(recording, scenario.speed[-1].value_rpm, scenario.load[0].at_s)["speed_dip_rpm"]
+    return {"ripple_step": max(_ripple(recording, window) for window in count_cases.windows_s(scenario)),
+            "speed_dip_rpm": dip_rpm}
+
+
 def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load."""
-    return {"speed_swing_rpm": float(np.ptp(recording["speed_rpm"]))}
+    """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load; under a sine also
+    relative to that of a shaft that only the sine moves."""
+    swing_rpm = float(np.ptp(recording["speed_rpm"]))
+    free_rpm = _free_swing_rpm(scenario)
+    return {"speed_swing_rpm": swing_rpm, **({"swing_of_free": swing_rpm / free_rpm} if free_rpm else {})}
 
 
 def held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -278,10 +290,7 @@ def random_load_metrics(scenario: Scenario, recording: np.ndarray, window_s: Win
         "peak_current_A": max(float(np.max(current)) for current in currents),
     }
     if swing_Nm:
-        inertia_kg_m2 = load_machine(machine_path(scenario.machine)).inertia_kg_m2 * scenario.bench["inertia_gain"]
-        angular_frequency = 2.0 * math.pi * scenario.bench["load_sine_frequency_Hz"]
-        free_rpm = 2.0 * swing_Nm / (inertia_kg_m2 * angular_frequency) * 30.0 / math.pi
-        values["swing_ratio"] = max(0.0, float(np.ptp(speed_rpm)) - ALLOWANCE_RPM) / free_rpm
+        values["swing_ratio"] = max(0.0, float(np.ptp(speed_rpm)) - ALLOWANCE_RPM) / _free_swing_rpm(scenario)
         values["mean_error_percent"] = 100.0 * max(
             0.0, abs(float(np.mean(speed_rpm)) - reference_rpm) - ALLOWANCE_RPM) / reference_rpm
     else:
@@ -322,6 +331,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "late_ripple": late_ripple_metrics,
     "start": start_metrics,
     "load_step": load_step_metrics,
+    "counts": counts_metrics,
     "moving": moving_metrics,
     "held": held_metrics,
     "held_part": held_part_metrics,
@@ -358,6 +368,16 @@ def failures(values: Metrics, peak_A: float = PEAK_CURRENT_MAX_A) -> list[str]:
             metric = METRICS[name]
             wrong.append(f"{metric.label} {value:.{metric.decimals}f} {metric.unit}".rstrip())
     return wrong
+
+
+def _free_swing_rpm(scenario: Scenario) -> float:
+    """Peak-to-peak speed of a shaft that only the load's sine moves, 0 without one."""
+    swing_Nm = scenario.bench.get("load_sine_amplitude_Nm", 0.0)
+    if not swing_Nm:
+        return 0.0
+    inertia_kg_m2 = load_machine(machine_path(scenario.machine)).inertia_kg_m2 * scenario.bench.get("inertia_gain", 1.0)
+    angular_frequency = 2.0 * math.pi * scenario.bench["load_sine_frequency_Hz"]
+    return 2.0 * swing_Nm / (inertia_kg_m2 * angular_frequency) * 30.0 / math.pi
 
 
 def _ripple(recording: np.ndarray, window_s: tuple[float, float]) -> float:

@@ -15,6 +15,7 @@ from salient.experiments.compare.runner import RunMetrics
 from salient.experiments.compare.targets import TARGETS, Key, Target, target_of
 
 NEVER = "never"
+_WORST = 10
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ class Row:
         """The metric's label with statistic and unit."""
         _, _, name, statistic = self.key
         metric = METRICS[name]
-        label = {"median": "median ", "worst": "max. ", "gap": "gap of "}.get(statistic, "") + metric.label
-        return f"{label}, {metric.unit}" if metric.unit else label
+        prefixes = {"median": "median ", "worst": "max. ", "gap": "gap of ", "spread": "max. over median of "}
+        label = prefixes.get(statistic, "") + metric.label
+        return f"{label}, {metric.unit}" if metric.unit and statistic != "spread" else label
 
 
 def make_rows(runs: Iterable[RunMetrics], targets: Mapping[Key, Target] = TARGETS) -> list[Row]:
@@ -99,7 +101,11 @@ def _statistic(statistic: str, values: Sequence[float | None]) -> float | None:
     numbers = sorted(math.inf if value is None else value for value in values)
     if statistic == "gap":
         return max(after - before for before, after in pairwise([*numbers, numbers[0] + STROKE_DEG]))
-    value = max(numbers) if statistic == "worst" else statistics.median(numbers)
+    if statistic == "spread":
+        median = statistics.median(numbers)
+        value = numbers[-1] / median if 0.0 < median < math.inf else math.inf
+    else:
+        value = max(numbers) if statistic == "worst" else statistics.median(numbers)
     return None if math.isinf(value) else value
 
 
@@ -176,6 +182,20 @@ def _lines(row: Row, columns: Sequence[str]) -> list[str]:
     lines = [f"    {row.label:<36}{cells}{limits}  {format_published(row):<15}  {status(row)}".rstrip()]
     if row.reached is False and row.target.reason:
         lines.append(f"      {row.target.reason}")
+    return lines
+
+
+def worst(runs: Sequence[RunMetrics]) -> list[str]:
+    """The runs with the largest values of the metrics of which groups name them, a line each below one of the group."""
+    lines = []
+    for name, group in GROUPS.items():
+        for metric in group.worst:
+            found = [run for run in runs if run.case.group == name and run.metrics.get(metric) is not None]
+            found.sort(key=lambda run: -float(run.metrics[metric] or 0.0))
+            if found:
+                lines.append(f"{name}: largest {METRICS[metric].label}")
+            lines += [f"  {format_value(metric, run.metrics[metric]):>12}  {run.case.condition}: {run.case.sample}"
+                      for run in found[:_WORST]]
     return lines
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from salient.experiments.compare import random_cases, range_cases, speed_range
+from salient.experiments.compare import count_cases, random_cases, range_cases, speed_range
 from salient.experiments.compare.case import MACHINES, MAGNETICS
 from salient.experiments.compare.cases import ANGLES, COMPRESSORS
 from salient.experiments.compare.metrics import (
@@ -194,6 +194,21 @@ def _ranges() -> dict[Key, Target]:
     return targets
 
 
+def _counts() -> dict[Key, Target]:
+    """The ripple hardly depends on the speed; with 17 bits it is below 2 % everywhere."""
+    targets = {}
+    of_group = (("speeds", count_cases.SAMPLED, count_cases.BITS),
+                ("every_speed", (*MACHINES, *count_cases.OUTSIDE), count_cases.BITS_ALL))
+    for group, machines, resolutions in of_group:
+        for machine in machines:
+            for bits in resolutions:
+                condition = count_cases.condition(machine, bits)
+                targets[group, condition, "ripple_step", "spread"] = Target(1.5 if bits >= 14 else 2.0)
+                if bits == 17 and machine in MACHINES:
+                    targets[group, condition, "ripple_step", "worst"] = Target(0.02)
+    return targets
+
+
 def _robustness() -> dict[Key, Target]:
     limits = {("failed", "count"): 0.0, ("peak_current_A", "worst"): PEAK_CURRENT_MAX_A,
               ("highest_speed_percent", "worst"): SPEED_MAX_PERCENT}
@@ -211,7 +226,7 @@ def _robustness() -> dict[Key, Target]:
 
 
 TARGETS: dict[Key, Target] = {**_ripples(), **_starts(), **_dips(), **_moving_loads(), **_compressors(),
-                              **_paper_conditions(), **_ranges(), **_robustness()}
+                              **_paper_conditions(), **_ranges(), **_counts(), **_robustness()}
 _EVERY_CONDITION = {
     ("machines", "ripple_to_allowed", ""): Target(1.0),
     **{(group, metric, ""): Target(limit)
