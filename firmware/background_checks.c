@@ -158,12 +158,12 @@ static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *inp
     }
 }
 
-/* As in the integral of the voltage. */
+/* Threshold of the integral of the voltage. */
 static bool no_current(const phase_monitor_input_t *input, unsigned phase) {
     return input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
 }
 
-/* By what the deferred step has found in windows of its own, read between two of its updates. */
+/* Factor by what the deferred step has found in windows of its own, read between two of its updates. */
 static int32_t factor_by_shaft_q30(drive_t *drive) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const deferred_t *deferred = &drive->control.deferred;

@@ -61,7 +61,7 @@ typedef struct {
     phase_monitor_t phases;
     phase_balance_t balance;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
-    bool conduction_ends;      /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
+    bool conduction_ends; /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
     shaft_torque_t shaft_torque;
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;

@@ -109,7 +109,7 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
     }
 }
 
-/* Of the readings without a current, 2^8. */
+/* Memory of the readings without a current: 2^8. */
 #define REST_BITS 8
 
 /* Longest interval: half a second at 100 kHz of the largest current. */

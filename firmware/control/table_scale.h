@@ -13,14 +13,16 @@
  *   integral of (v - R0 i) dt = s psi_t + (R - R0) integral of i dt                                           (1)
  *   integral of i (v - R0 i) dt = s W_t + (R - R0) integral of i^2 dt                                         (2)
  *
- * s and R - R0 of sums over the last intervals of all phases, (1) weighted by the charge, (2) by the sign of W_t, with
- * old intervals forgotten. Errors of the voltage that a current has, as drops which the machine file does not state,
- * count as resistance. Derived here; the energy balance is that of J. M. Stephenson, J. Corda, "Computation of torque
- * and current in doubly salient reluctance motors from nonlinear magnetization data", Proc. IEE 126(5), 1979.
+ * s and R - R0 follow from sums over the last sixteen intervals of all phases: (1) weighted by the charge, over the
+ * samples at the end of the interval, the smaller their flux linkage the more; (2) by the sign of W_t. Errors of the
+ * voltage that a current has, as drops which the machine file does not state, count as resistance. Derived here; the
+ * energy balance is that of J. M. Stephenson, J. Corda, "Computation of torque and current in doubly salient reluctance
+ * motors from nonlinear magnetization data", Proc. IEE 126(5), 1979.
  *
  * s is exact for tables that err by a factor; for tables that err in their shape, or at an angle that is wrong, it is
- * the factor of the mean torque. Not observable: errors of the current's gain g, because i dpsi is larger by it, and of
- * the DC-link voltage's gain, likewise: the torque then errs by that gain.
+ * the factor of the mean torque. What a sensor reads without a current is taken for its offset. Not observable: errors
+ * of the current's gain g, because i dpsi is larger by it, and of the DC-link voltage's gain, likewise: the torque then
+ * errs by that gain.
  */
 #ifndef CONTROL_TABLE_SCALE_H
 #define CONTROL_TABLE_SCALE_H
@@ -37,7 +39,7 @@
 #define TABLE_SCALE_MIN_Q30 751619277  /* 0.7 */
 #define TABLE_SCALE_MAX_Q30 1503238554 /* 1.4 */
 
-/* Of a phase; all zero at the start. */
+/* State of a phase; all zero at the start. */
 typedef struct {
     bool ended;       /* the current has fallen so far that the integral of the voltage is limited to 0 */
     bool whole;       /* sampled since its current was zero */
@@ -58,7 +60,7 @@ typedef struct {
     table_scale_phase_t phase[HAL_PHASES_MAX];
     int64_t applied_q30, table_q30, square_q10; /* sums of (2) */
     int64_t end, end_table, charge;             /* sums of (1), weighted: Wb A periods, Q21 Q1; A^2 periods^2, Q1 Q1 */
-    bool differs;                               /* s is another one than 1: from 1/100 on, until it is within 1/200 */
+    bool differs;                               /* s is another one than 1: from 1/40 on, until it is within 1/80 */
     uint32_t intervals;                         /* since the start, at most TABLE_SCALE_INTERVALS_MIN */
     int32_t scale_q30;                          /* s of the sums, Q1.30 */
     int32_t smooth_q30;                         /* that follows it, Q1.30 */

@@ -14,8 +14,8 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
     state_machine_reset(&state->state_machine);
     control_prepare(parameters, state);
     state->deferred_request.initial.observer = load_observer_inertia(&parameters->observer, 0);
-    state->table_scale = table_scale_factors(TABLE_SCALE_ONE_Q30, parameters->predictive.period_q40,
-                                             &parameters->predictive.flux);
+    state->table_scale =
+        table_scale_factors(TABLE_SCALE_ONE_Q30, parameters->predictive.period_q40, &parameters->predictive.flux);
 }
 
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {

@@ -172,3 +172,19 @@ def test_other_inertia_is_no_gain_of_the_current_sensors(make_bench, inertia):
     bench.drive.torque_reference_Nm = 0
     bench.run_for(0.05)
     assert abs(alternating(bench, 8, 0.12, 8)[-2:] - 1).max() < 0.005
+
+
+# --- a wrong angle --------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(("machine", "early"), [("saturating", (0.06, 0.1)), ("finite_element", (0.25, 0.4))])
+@pytest.mark.parametrize("offset_deg", [1.0, -1.0])
+def test_displaced_encoder_is_a_ripple_for_a_second_but_no_error_of_the_mean_torque(make_bench, machine, early,
+                                                                                     offset_deg):
+    """In torque mode its flux linkage alone shows the angle, from 1.1 s on (firmware/control/flux_angle.c)."""
+    bench = held(make_bench, machine, 300)
+    bench.rig.encoder_offset_deg = offset_deg
+    bench.run_for(0.05)
+    assert torque_after(bench, 12, 0.95) == pytest.approx(12, rel=0.03)
+    assert early[0] < ripple(bench) < early[1]
+    assert torque_after(bench, 12, 1.4) == pytest.approx(12, rel=0.02)
+    assert 0.0005 < ripple(bench) < 0.012
