@@ -16,8 +16,9 @@ def data_of(machine):
     return scaling_of(path, load_machine(path)).data
 
 
-def held(make_bench, machine, speed_rpm, flux=1.0, resistance=1.0, table_scale=2, **options):
+def held(make_bench, machine, speed_rpm, flux=1.0, resistance=1.0, table_scale=2, encoder_offset_deg=0.0, **options):
     bench = make_bench(machine=machine, **options)
+    bench.rig.encoder_offset_deg = encoder_offset_deg
     bench.drive.parameters["table_scale"] = table_scale
     bench.rig.flux_linkage_gain = flux
     bench.rig.resistance_gain = resistance
@@ -181,9 +182,7 @@ def test_other_inertia_is_no_gain_of_the_current_sensors(make_bench, inertia):
 def test_displaced_encoder_is_a_ripple_for_a_second_but_no_error_of_the_mean_torque(make_bench, machine, early,
                                                                                      offset_deg):
     """In torque mode its flux linkage alone shows the angle, from 1.1 s on (firmware/control/flux_angle.c)."""
-    bench = held(make_bench, machine, 300)
-    bench.rig.encoder_offset_deg = offset_deg
-    bench.run_for(0.05)
+    bench = held(make_bench, machine, 300, encoder_offset_deg=offset_deg)
     assert torque_after(bench, 12, 0.95) == pytest.approx(12, rel=0.03)
     assert early[0] < ripple(bench) < early[1]
     assert torque_after(bench, 12, 1.4) == pytest.approx(12, rel=0.02)
