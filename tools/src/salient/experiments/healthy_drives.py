@@ -6,8 +6,8 @@ Drive n has the random machine n of random_machines.WHOLE_RANGE, 0.05 to 2000 N 
 and current sensors as real ones have them, and is in the healthy world of seed n of the campaign (emulator/campaign):
 controller, rate, encoder, winding from -40 to 155 C, flux linkage, inertia, friction, speeds, loads, torques. Prints a
 line for each drive that reports a fault, and for each machine that is refused, and the number of false ones: those
-without a reason in the plant, or with one that is the drive's own work, as a light rotor that torque mode lets exceed its
-speed; exit code 1 when there is one.
+without a reason in the plant, or with one that is the drive's own work, as a light rotor that torque mode lets exceed
+its speed; exit code 1 when there is one.
 """
 
 from __future__ import annotations
