@@ -7,6 +7,7 @@
 #include "fixed/formats.h"
 
 #define SLOW_HZ 2000u
+#define FAST_HZ 2666u
 #define SLOW_BITS_MAX 12u
 #define DEADBEAT_HZ 250u
 #define PERIODS_MAX (UINT32_C(1) << 20)
@@ -28,6 +29,7 @@ slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigne
     const uint32_t deadbeat_periods = control_rate_hz / DEADBEAT_HZ; /* below 2^13 */
     return (slow_counts_parameters_t){
         .slow_periods = encoder_bits <= SLOW_BITS_MAX ? control_rate_hz / SLOW_HZ : UINT32_MAX,
+        .fast_periods = control_rate_hz / FAST_HZ,
         .deadbeat_periods = deadbeat_periods,
         .count = UINT32_C(1) << (32u - encoder_bits),
         .step_q31 = (uint32_t)INT32_MAX / deadbeat_periods,
@@ -81,7 +83,7 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
         counts->encoder_angle = encoder_angle;
         counts->apart = passed < PERIODS_MAX ? passed : PERIODS_MAX;
         counts->periods = counts->interval = 0;
-        counts->slow = long_since;
+        counts->slow = long_since || (counts->slow && passed >= parameters->fast_periods);
     } else if (long_since) {
         counts->slow = true;
     }

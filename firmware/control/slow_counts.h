@@ -1,6 +1,7 @@
 /* Slow counts: correction of the load observer while an encoder of up to 12 bits counts less often than twice in a
  * millisecond. From 13 bits on a load step moves the rotor by a count so soon that the bandwidth's own law is better:
- * at standstill by a tenth to a third of the dip.
+ * at standstill by a tenth to a third of the dip. They remain slow until one comes within 3/8 ms: where it is now one
+ * law and now the other, the mean speed is that of neither.
  *
  * Most samples then tell only that the rotor is within a count. Its middle, which is right for counts that pass within
  * a few periods, would draw speed and load towards a rotor at rest, and let them swing with each count. Instead:
@@ -40,6 +41,7 @@
 
 typedef struct {
     uint32_t slow_periods;          /* 0.5 ms; UINT32_MAX: counts are never slow */
+    uint32_t fast_periods;          /* 0.375 ms, below which they are no longer */
     uint32_t deadbeat_periods;      /* 4 ms */
     uint32_t count;                 /* 2^-32 rev */
     int32_t slope_gain_q16;         /* u of 4 ms for a slope in N m per 0.02 rad */

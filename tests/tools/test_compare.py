@@ -72,7 +72,7 @@ def test_every_target_belongs_to_a_row():
 
 def test_every_controller_runs_in_every_group_that_it_supports():
     for name, of in ALL_CASES.items():
-        salient = {key: {"salient"} for key in ("rates", "encoders", "misalignment", "standing_error", "hold",
+        salient = {key: {"salient"} for key in ("rates", "misalignment", "standing_error", "hold",
                                                 "torque_speed_random", "partial_torque", "copper", "copper_random",
                                                 "transition", "torque_conditions", "every_speed")}
         expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},

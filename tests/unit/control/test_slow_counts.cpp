@@ -53,16 +53,20 @@ double load_gain(const load_observer_gains_t &gains) {
     return -double(gains.load_gain_q28) / Q28 * (gains.load_factor_q4 / 16.0) / Q24 * REV / (2.0 * PI);
 }
 
-TEST_F(SlowCounts, are_those_of_half_a_millisecond) {
+TEST_F(SlowCounts, are_those_of_half_a_millisecond_until_there_are_some_of_three_eighths) {
     EXPECT_FALSE(wait(19));
     EXPECT_TRUE(wait(1));
     EXPECT_TRUE(wait(1, COUNT)) << "the next one";
     EXPECT_TRUE(wait(19, COUNT));
     EXPECT_TRUE(wait(1, 2 * COUNT)) << "after 20 periods";
-    EXPECT_TRUE(wait(18, 2 * COUNT));
-    EXPECT_FALSE(wait(1, 3 * COUNT)) << "after 19";
-    EXPECT_FALSE(wait(19, 3 * COUNT));
-    EXPECT_TRUE(wait(1, 3 * COUNT));
+    EXPECT_TRUE(wait(14, 2 * COUNT));
+    EXPECT_TRUE(wait(1, 3 * COUNT)) << "after 15";
+    EXPECT_TRUE(wait(13, 3 * COUNT));
+    EXPECT_FALSE(wait(1, 4 * COUNT)) << "after 14";
+    EXPECT_FALSE(wait(18, 4 * COUNT));
+    EXPECT_FALSE(wait(1, 5 * COUNT)) << "after 19, faster counts before";
+    EXPECT_FALSE(wait(19, 5 * COUNT));
+    EXPECT_TRUE(wait(1, 5 * COUNT));
 }
 
 TEST_F(SlowCounts, skipped_periods_count) {

@@ -54,7 +54,7 @@ def _lowest_rpm(name: str, encoder_bits: int) -> float:
     torque_Nm = RATED_PART * derive(machine).torque_rated_Nm
     strokes = machine.phases * machine.rotor_poles
     drift_s = math.sqrt(2.0 * machine.inertia_kg_m2 / (strokes * TORQUE_ERROR * torque_Nm))
-    return 60.0 / 2**encoder_bits * max(error_growth_1_s(machine) / GROWTH_MAX, 1.0 / drift_s)
+    return 60.0 / float(2**encoder_bits) * max(error_growth_1_s(machine) / GROWTH_MAX, 1.0 / drift_s)
 
 
 def error_growth_1_s(machine: Machine) -> float:
