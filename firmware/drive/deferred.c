@@ -229,8 +229,12 @@ NOINLINE static void learn_between_counts(const control_parameters_t *parameters
     const unsigned phase = deferred->misalignment.phase_index;
     const uint32_t angle = commutation_angle(&parameters->commutation, &commutation, phase) -
                            (uint32_t)deferred->misalignment.phase[phase].offset;
+    /* The laws that learn no misalignment have none. */
+    const int32_t told = parameters->torque_law == TORQUE_LAW_PREDICTIVE
+                             ? told_by_flux(parameters, deferred, flux_misalignment[phase])
+                             : 0;
     misalignment_follow_flux(&parameters->misalignment, &deferred->misalignment, &machine_tables, angle,
-                             input->current_q9, told_by_flux(parameters, deferred, flux_misalignment[phase]));
+                             input->current_q9, told);
     slow_counts_update(&parameters->slow_counts, &deferred->slow_counts,
                        misalignment_slope_q24(&deferred->misalignment));
 }

@@ -378,4 +378,31 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
     }
 }
 
+// Where the ripple teaches nothing: the phases in turn, each by its own angle, with its slope at hand.
+TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_half_of_the_rate) {
+    const misalignment_parameters_t parameters = parameters_of(8);
+    misalignment_t state;
+    misalignment_reset(&state);
+    state.steady_updates = 100;
+    const auto told = int32_t(electrical_rev_of(0.01) * REV);
+    const int updates = int(RATE_HZ) / 4;
+    for (int k = 0; k < updates; k++) {
+        const unsigned phase = state.phase_index;
+        EXPECT_EQ(phase, unsigned(k) % PHASES);
+        misalignment_follow_flux(&parameters, &state, &machine_tables, angle_from_rev(0.75), 15 * 512,
+                                 phase == 1 ? told : 0);
+    }
+    EXPECT_NEAR(state.phase[1].offset / double(told), 1.0 - std::exp(-8.0 / 2.0 / 4.0), 0.02);
+    EXPECT_EQ(state.phase[0].offset, 0) << "0: unknown";
+    EXPECT_EQ(state.steady_updates, 0u) << "the ripple begins anew";
+    const int32_t slope_q24 =
+        phase_map_torque_slope_q24(&machine_tables, angle_from_rev(0.75), 15 * 512, 2 * parameters.probe_angle);
+    EXPECT_EQ(misalignment_slope_q24(&state), int32_t(PHASES) * slope_q24);
+    EXPECT_NE(slope_q24, 0);
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        misalignment_follow_flux(&parameters, &state, &machine_tables, angle_from_rev(0.75), 0, 0);
+    }
+    EXPECT_EQ(misalignment_slope_q24(&state), 0) << "without current";
+}
+
 } // namespace
