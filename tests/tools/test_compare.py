@@ -24,7 +24,7 @@ from salient.experiments.compare import (
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, scenario_toml, start_scenario
 from salient.experiments.compare.every_machine import EXAMPLES
-from salient.experiments.compare.machine import cases_of, subject, targets_of
+from salient.experiments.compare.machine import cases_of, is_allowed, subject, targets_of
 from salient.experiments.compare.metrics import EXTRACTORS, METRICS, failures, peak_current_max_A
 from salient.experiments.compare.random_cases import random_drive, random_load
 from salient.experiments.compare.runner import RunMetrics, _run, run_all
@@ -437,7 +437,9 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
     for name, of in ALL_CASES.items():
         if name == "machines" or name in speed_range.GROUPS:  # of its own
             continue
-        own = [case for case in of if case.scenario.machine == "saturating" and case.extractor != "counts"]
+        own = [case for case in of if case.scenario.machine == "saturating" and case.extractor != "counts" and is_allowed(
+            replace(case.scenario, machine=on.path, speed=tuple(replace(step, value_rpm=scale.rpm(step.value_rpm))
+                                                                for step in case.scenario.speed)))]
         of_machine = [case for case in cases_of(of, on) if case.extractor != "counts"]
         for case, scaled in zip(own, of_machine, strict=True):
             assert scaled.scenario.machine == on.path and "saturating" not in scaled.condition

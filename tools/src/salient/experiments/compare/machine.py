@@ -70,7 +70,7 @@ def subject(name_or_path: str) -> Subject:
     })
 
 
-def _allowed(scenario: Scenario) -> bool:
+def is_allowed(scenario: Scenario) -> bool:
     """False when the drive is refused a speed with the scenario's encoder."""
     lowest_rpm = lowest_speed_rpm(scenario.machine, scenario.encoder_bits, scenario.controller)
     return all(step.value_rpm == 0.0 or abs(step.value_rpm) >= lowest_rpm for step in scenario.speed)
@@ -87,7 +87,7 @@ def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Ca
             continue
         if case.scenario.machine == PAPER:
             own_case = _case(case, on)
-            if _allowed(own_case.scenario):
+            if is_allowed(own_case.scenario):
                 of_paper.append(own_case)
         elif case.extractor == "every_machine":
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
@@ -105,7 +105,13 @@ def targets_of(on: Subject) -> dict[Key, Target]:
     return {(group, on.text(condition), metric, statistic): replace(
                 target, limit=None if target.limit is None else target.limit * _RELATIVE[group, metric](on.scale))
             for (group, condition, metric, statistic), target in TARGETS.items()
-            if (group, metric) in _RELATIVE and condition.split(",")[0] == PAPER}
+            if (group, metric) in _RELATIVE and condition.split(",")[0] == PAPER and _has_runs(on.text(condition), on)}
+
+
+def _has_runs(condition: str, on: Subject) -> bool:
+    """False for an encoder and a speed that the drive is refused."""
+    bits, rpm = re.search(r"(\d+) bits", condition), re.search(r"([\d.]+) r/min", condition)
+    return not bits or not rpm or float(rpm[1]) >= lowest_speed_rpm(on.path, int(bits[1]), "salient")
 
 
 def _case(case: Case, on: Subject) -> Case:
