@@ -7,7 +7,7 @@ their currents, and grows where K is positive:
     J d2(error)/dt2 = K error,   s = sqrt(max K / J) in 1/s
 
 The drive's law of slow counts (firmware/control/slow_counts.h) reckons with that, up to s t = 4.5 with `salient`, whose
-torque is smooth, and half of that with the laws of hysteresis and duty. What the torque estimate errs by, e, changes
+torque is smooth, half of that with `paper` and a third with `traditional`. What the torque estimate errs by, e, changes
 with the strokes, of which there are n in a turn: from count to count by 2 pi e n / 2^bits, which moves the rotor by a
 count in t = sqrt(2 J / (n e)). That is the other bound of t, with e of a fiftieth of the torque. Both constants are
 found by trial with the bundled machines and others, 9 to 14 bits.
@@ -31,7 +31,7 @@ COARSE_BITS = 12
 
 GROWTH_MAX = 4.5
 TORQUE_ERROR = 0.02
-HASTE = {"salient": 1.0, "paper": 2.0, "traditional": 2.0}
+HASTE = {"salient": 1.0, "paper": 2.0, "traditional": 3.0}
 """How much closer the counts are to be, by controller."""
 
 RATED_PART = 0.5
