@@ -11,12 +11,13 @@
  *   it has not, and the      none
  *   prediction is within it
  *   the prediction has       distance to it, with l1 = 1, so that the estimate remains at the edge until the rotor
- *   left it                  arrives there; l2, l3 of an edge at the time when it left, but no closer than 4 ms
+ *   left it                  arrives there; l2, l3 of an edge now, but neither closer than 4 ms nor later than the
+ *                            estimated speed takes for a count
  *
  * The gains are those of load_observer.h for edges a time t apart, with q = 1 - t / 4 ms, from 4 ms on q = 0, with
  * which three edges determine the estimate; l3 is half of that: a load that changed since the last edge has had less
  * time than t. Found by trial with 8 to 14 bits at 5 to 600 r/min. A prediction that is late has the gains of its own
- * time, and not of 4 ms, because it contradicts the estimate by no more than its lateness: answered by gains of a
+ * time, not of 4 ms, because it contradicts the estimate by no more than its lateness: answered by gains of a
  * shorter time the rotor is driven to each edge and passes the next ones too early, and its mean speed is a third
  * above the estimated one.
  *
