@@ -423,9 +423,11 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         if (state->partial_q15 > 0) {
             state->part = pulse_for_torque(tables, state);
         }
-        state->sharing = sharing_for_torque(tables, state);
         break;
     case 3:
+        state->sharing = sharing_for_torque(tables, state);
+        break;
+    case 4:
         limit_torque(parameters, state, sample);
         set_interval(parameters, state);
         break;

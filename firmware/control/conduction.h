@@ -142,7 +142,7 @@ typedef struct {
     uint32_t on, off;
 } conduction_sharing_t;
 
-#define CONDUCTION_STEPS 5   /* of an update */
+#define CONDUCTION_STEPS 6   /* of an update */
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
 typedef struct {
@@ -222,8 +222,8 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* One of the steps of an update, in turn: tables, level, pulse for a part of the torque, limits and positions, angles.
- * Products are rounded down; the level to 2^-15, angles of the tables to 2^-24. */
+/* One of the steps of an update, in turn: tables, level, pulse for a part of the torque, window of torque sharing,
+ * limits and positions, angles. Products are rounded down; the level to 2^-15, angles of the tables to 2^-24. */
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 

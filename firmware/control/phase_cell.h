@@ -119,18 +119,12 @@ ALWAYS_INLINE int32_t phase_cell_torque(const phase_cell_t *cell, int32_t v_q13)
     return phase_cell_evaluate(cell->torque.middle, cell->torque.rise, cell->curvature, v_q13);
 }
 
-/* A slope of the torque as divisor, at least 1. Where no current makes torque, before poles overlap, the tables have
- * what rounding leaves there, of any sign: more torque is to be more flux linkage, not less. */
-ALWAYS_INLINE int32_t phase_cell_positive(int32_t slope) {
-    return (slope & ~(slope >> 31)) | 1;
-}
-
 ALWAYS_INLINE int32_t phase_cell_solve_q13(const phase_cell_t *cell, int32_t torque) {
     const int32_t rest = phase_cell_dividend(fixed_subtract(torque, cell->torque.middle));
-    const int32_t rise = phase_cell_positive(phase_cell_divisor(cell->torque.rise));
+    const int32_t rise = phase_cell_divisor(cell->torque.rise);
     const int32_t curvature = cell->curvature >> 8; /* in the unit of the divisor */
     const int32_t first_q13 = fixed_saturate_bits(rest / rise, PHASE_CELL_FIRST_BITS);
-    const int32_t slope = phase_cell_positive(rise + ((curvature * first_q13) >> 12));
+    const int32_t slope = (rise + ((curvature * first_q13) >> 12)) | 1;
     const int32_t dividend = rest + curvature * ((first_q13 * first_q13) >> 13);
     return fixed_saturate_bits(dividend / slope, PHASE_CELL_BITS);
 }

@@ -49,6 +49,10 @@ _ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # fractions of 
 # current, where its flux linkage is extrapolated linearly, by any amount.
 FALL_TOLERANCE = 0.01
 
+# Torque, as a fraction of the largest at the same current, that is none: what a spline through a map leaves before the
+# poles overlap, of any slope. A phase that is to make a torque there would turn its current off.
+_NO_TORQUE = 1e-3
+
 # Columns from the middle of a cell to which the firmware extrapolates the flux linkage of a sample
 # (firmware/control/phase_cell.h), which it converts to its format without saturation.
 _EXTRAPOLATED_COLUMNS = 4.0
@@ -191,7 +195,7 @@ def _largest_flux_linkage_Wb(surface: Surface) -> float:
 
 
 def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
-    """Torque that nowhere falls with the current, nor below zero."""
+    """Torque that nowhere falls with the current, nor below zero; 0 where it is next to nothing."""
     torque_Nm = magnetics.torque_Nm(angle_rad, CURRENT_A)
     torque_Nm = np.where(CURRENT_A > 0.0, torque_Nm, 0.0)  # not what rounding leaves there
     rising_Nm = np.maximum.accumulate(np.maximum(torque_Nm, 0.0), axis=1)
@@ -204,7 +208,7 @@ def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
             f" {torque_Nm[row, column] * magnetics.newton_metre:.4g} N m at {CURRENT_A[column] * magnetics.ampere:g} A;"
             f" it must rise with the current, except for {FALL_TOLERANCE:.0%} of the largest torque at that current"
         )
-    return rising_Nm
+    return np.where(rising_Nm > _NO_TORQUE * rising_Nm.max(axis=0), rising_Nm, 0.0)
 
 
 def _surface(what: str, unit: str, in_unit: float, values: np.ndarray, fraction_bits: tuple[int, int],
@@ -219,6 +223,9 @@ def _surface(what: str, unit: str, in_unit: float, values: np.ndarray, fraction_
             continue
         for shift in range(CURVATURE_SHIFT_MAX + 1):
             curvature = np.floor(curvatures * 2.0 ** (bits - shift) + 0.5)
+            # The parabola that begins or ends at zero does not go below.
+            most = np.floor(np.maximum(node[:-1], node[1:]) * 2.0**-shift)
+            curvature = np.where(np.minimum(node[:-1], node[1:]) > 0.0, curvature, np.minimum(curvature, most))
             if np.max(np.abs(curvature)) <= 127:
                 return Surface(bits, result_bits, shift, node.astype(int), curvature.astype(int))
     raise PhaseMapError(f"{np.max(values) * in_unit:.4g} {unit} of {what} is more than the firmware's tables hold")
