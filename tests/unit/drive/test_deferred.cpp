@@ -201,6 +201,8 @@ TEST_F(Deferred, steps_that_are_late_by_up_to_seven_periods_are_no_fault) {
 }
 
 TEST_F(Deferred, a_late_step_does_not_undo_the_reset_of_the_windows_at_the_end_of_a_run) {
+    parameters.conduction.own_windows = false;
+    parameters.conduction.sharing.turn_on_advance = 1u << 28;
     start();
     for (int k = 0; k < 400; k++) {
         period(COMMAND_RUN, 3000.0);

@@ -2,10 +2,11 @@
 speed and torque.
 
 Angles are electrical degrees past the begin of the half of the wanted torque: motoring from the unaligned, braking from
-the aligned position. At standstill they are those of least_current.py. With speed the voltage limits the rate of the flux linkage: phases follow their shares as far
-as it permits, the others make up for them as in firmware/control/predictive_torque.h, and the best window is one that
-begins and ends earlier. By how much is found by simulation at the base speed; it is proportional to the speed, as is
-the angle in which a voltage builds up a flux linkage.
+the aligned position. At standstill they are those of least_current.py. With speed the voltage limits the rate of the
+flux linkage: phases follow their shares as far as it permits, the others make up for them as in
+firmware/control/predictive_torque.h, and the best window is one that begins and ends earlier. By how much is found by
+simulation at the base speed; it is proportional to the speed, as is the angle in which a voltage builds up a flux
+linkage.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ class _Phases:
             row = np.where(past <= _HALF, past, _TURN - past)
             row = (_HALF - row if braking else row)[:, None]
             since_on_deg = np.where(inside, past[:, None] * _STEP_DEG - on_deg, -1.0)
-            share = np.where(inside, sharing_function(past[:, None] * _STEP_DEG - on_deg, self.stroke_deg, overlap_deg), 0.0)
+            share = np.where(inside, sharing_function(since_on_deg, self.stroke_deg, overlap_deg), 0.0)
             free_Wb = flux_Wb - self.drop_ohm * step_s * current_A
             least_Wb = np.maximum(free_Wb - step_Wb, 0.0)
             most_Wb = np.minimum(free_Wb + step_Wb, self.flux_top_Wb[row])
