@@ -80,7 +80,7 @@ enum { CONDUCTION_MOTORING, CONDUCTION_BRAKING, CONDUCTION_HALVES };
 /* Angles in 2^-32 electrical rev, of a phase mirrored into 2^31 unaligned .. 2^32 aligned. */
 typedef struct {
     torque_sharing_window_t window;
-    uint32_t width; /* from turn-on to where a phase makes up for no shortfall any more; HALF_REV: it always does */
+    uint32_t width; /* from turn-on to where a phase makes up for no shortfall any more; UINT32_MAX: it always does */
     uint32_t lead;  /* before the end of the half, of the turn-on for the half that follows; 0: no pulse */
     /* A phase past the angle `end` carries at most the flux linkage of which -Vdc leaves `flux` there, in units of the
      * tables. */

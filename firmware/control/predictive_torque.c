@@ -39,8 +39,8 @@ typedef struct {
     int32_t flux_max;         /* that a period of +Vdc reaches, or less */
     int32_t freewheeling_q29; /* flux linkage after a period without voltage, Wb */
     uint32_t angle;           /* 2^-32 electrical rev, mirrored into the half of positive torque */
-    uint32_t since_on;        /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on, or ended */
-    int32_t limit;            /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
+    uint32_t since_on; /* angle past turn-on, 2^-32 electrical rev; from 2^31: before turn-on; UINT32_MAX: ended */
+    int32_t limit;     /* -1: at flux_min, 1: at flux_max or at the current limit, 0: torque reached */
 } plan_t;
 
 /* Operating point within the cell, or at its end, for a torque within flux_min, flux_max and the current limit, by
@@ -127,15 +127,16 @@ NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, in
 }
 
 /* Corrects one phase by the torque shortfall (signed) where it can change in that direction; returns the rest. Of the
- * half that carries the reference: a shortfall goes to the phase that entered last, an excess is taken from the one
- * that entered first. Without such a phase an opposed one may reduce its torque. */
+ * half that carries the reference: a shortfall goes to the phase that entered last, of motoring phases after them to
+ * one before its turn-on where the window is that of torque sharing, an excess is taken from the one that entered
+ * first. Without such a phase an opposed one may reduce its torque. */
 static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
                                      int32_t current_limit_q9, int32_t shortfall) {
     const bool increase = (shortfall > 0) == positive;
     const int8_t sign = positive ? 1 : -1;
     const int32_t limit = increase ? 1 : -1;
     /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. The order of entry
-     * is that of since_on or the reverse; phases before turn-on stay last. */
+     * is that of since_on or the reverse; phases before turn-on are last, or, in the reverse order, none. */
     const uint32_t reversal = ((positive != reverse) == increase) ? 0 : HALF_REV - 1;
     plan_t *corrected = NULL;
     plan_t *opposed = NULL;
