@@ -51,7 +51,7 @@ FALL_TOLERANCE = 0.01
 
 # Torque, as a fraction of the largest at the same current, that is none: what a spline through a map leaves before the
 # poles overlap, of any slope. A phase that is to make a torque there would turn its current off.
-_NO_TORQUE = 1e-3
+_NO_TORQUE = 5e-4
 
 # Columns from the middle of a cell to which the firmware extrapolates the flux linkage of a sample
 # (firmware/control/phase_cell.h), which it converts to its format without saturation.
