@@ -133,8 +133,9 @@ static int64_t drift_of(const encoder_monitor_parameters_t *parameters, const en
 static int32_t drift_since_zero_q29(const encoder_monitor_parameters_t *parameters,
                                     const encoder_monitor_input_t *input, unsigned index, uint32_t age, bool small) {
     const int32_t drop_q29 = input->drop_q29[index];
-    const int32_t resistive_q29 =
-        small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(&machine_tables, drop_q29);
+    const int64_t device_q29 = (int64_t)applied_flux_device_q29(&machine_tables, parameters->period_q40) * age;
+    const int64_t resistive_q29 =
+        small ? applied_flux_cold_q29(drop_q29) : applied_flux_warm_q29(&machine_tables, drop_q29) + device_q29;
     const int64_t drift_q29 = drift_of(parameters, input, true) * (int32_t)age;
     return fixed_saturate(input->flux_step_max_q29 / 4 + applied_flux_independent(drift_q29, resistive_q29));
 }
