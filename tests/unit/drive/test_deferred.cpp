@@ -566,11 +566,11 @@ TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
     for (int k = 0; k < 60000; k++) {
         period(COMMAND_OFF);
     }
-    ASSERT_EQ(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
+    ASSERT_EQ(state.bandwidth.stage, OBSERVER_BANDWIDTH_STEADY_STAGE);
     interrupt(COMMAND_OFF);
     turns += 4.0 / (1 << ENCODER_BITS);
     interrupt(COMMAND_OFF); // skipped
-    ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STAGES - 1u);
+    ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STEADY_STAGE);
     EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000);
     deferred_step(&parameters, &state, &command);
     EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000) << "the input is that of the period before";
