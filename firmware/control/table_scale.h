@@ -106,8 +106,9 @@ ALWAYS_INLINE int32_t table_scale_multiply(int32_t torque_q24, int32_t excess_q3
 /* No interval, scale 1. */
 void table_scale_reset(table_scale_t *scale);
 
-/* One sample of a phase; least_q9: current that an interval has to exceed to count, A, Q7.9. [background] */
-void table_scale_add(table_scale_t *scale, unsigned phase, const table_scale_sample_t *sample, int32_t least_q9);
+/* One sample of the phase with an index; least_q9: current that an interval has to exceed to count, A, Q7.9.
+ * [background] */
+void table_scale_add(table_scale_t *scale, unsigned index, const table_scale_sample_t *sample, int32_t least_q9);
 
 /* Part by which smooth_q30 follows in a control period, for a time constant of 0.2 s: Q0.31. */
 static inline int32_t table_scale_part_q31(uint32_t control_rate_hz) {

@@ -76,7 +76,7 @@ def test_reported_torque_is_what_the_other_phases_make(make_bench, machine, cont
     assert torque_Nm.mean() == pytest.approx(mean_Nm, rel=0.06)
     # With windows up to the aligned position a current ends a little past it.
     assert torque_Nm.min() > -0.6
-    # paper charges a phase shortly before its unaligned position, where it brakes by less than a tenth of a newton metre.
+    # paper charges a phase shortly before its unaligned position, where it brakes by less than a tenth of 1 N m.
     tolerance_Nm = 0.1 if controller == "paper" else 0.05
     assert degraded(bench, "torque_least_Nm") == pytest.approx(max(torque_Nm.min(), 0.0), abs=tolerance_Nm)
 

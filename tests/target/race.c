@@ -266,6 +266,11 @@ void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases) {
     (void)monitor, (void)phases;
 }
 
+int32_t phase_monitor_drop_q29(const phase_monitor_t *monitor, const phase_monitor_input_t *input, unsigned phase) {
+    (void)monitor, (void)input, (void)phase;
+    return 0;
+}
+
 uint32_t phase_balance_step(phase_balance_t *balance, const phase_balance_sample_t *sample) {
     (void)balance, (void)sample;
     return 0;

@@ -68,4 +68,6 @@ def _cubic(part: np.ndarray) -> np.ndarray:
 
 def sharing_function(since_on_deg: np.ndarray, stroke_deg: float, overlap_deg: np.ndarray | float) -> np.ndarray:
     """The cubic of torque_sharing.h."""
-    return _cubic(since_on_deg / overlap_deg) - _cubic((since_on_deg - stroke_deg) / overlap_deg)
+    rising, falling = _cubic(since_on_deg / overlap_deg), _cubic((since_on_deg - stroke_deg) / overlap_deg)
+    share: np.ndarray = rising - falling
+    return share
