@@ -66,11 +66,11 @@ static difference_t difference(const machine_tables_t *tables, uint32_t angle, i
 void pwm_ditc_set_reference_point(pwm_ditc_parameters_t *parameters, const machine_tables_t *tables, uint32_t angle,
                                   int32_t voltage_step_q29) {
     const difference_t at = difference(tables, angle, parameters->current_limit_q9 >> 1);
-    const int64_t torque = at.torque > 0 ? at.torque : 1; /* without torque there the largest values */
-    const int64_t flux_q29 = at.flux_q29 > 0 ? at.flux_q29 : 1;
+    const int64_t torque = at.torque > 0 ? at.torque : 1;                /* without torque there the largest values */
+    const int64_t flux_q29 = fixed_clamp(at.flux_q29, 1, (1 << 29) - 1); /* below 1 Wb */
     parameters->torque_per_flux_q16 = fixed_saturate(fixed_divide(torque << 16, flux_q29));
-    parameters->duty_per_torque_q44 =
-        fixed_saturate(fixed_divide(fixed_divide(flux_q29 << 34, torque) << 10, voltage_step_q29));
+    const int64_t flux_per_torque_q34 = fixed_clamp_64(fixed_divide(flux_q29 << 34, torque), 0, INT64_MAX >> 10);
+    parameters->duty_per_torque_q44 = fixed_saturate(fixed_divide(flux_per_torque_q34 << 10, voltage_step_q29));
 }
 
 /* expected / torque, limited, within 0.1 %: a division of 32 bits. */

@@ -115,7 +115,16 @@ static void end(table_scale_t *scale, const table_scale_phase_t *phase, int32_t 
 /* Longest interval: half a second at 100 kHz of the largest current. */
 #define CHARGE_MAX_Q10 (INT64_C(1) << 40)
 
-/* Trapezoidal rule; the square of a current that changes linearly. */
+/* Mean square of a current that changes linearly, A^2, Q18, within 8 LSB: a third of below 2^34, without a division of
+ * 64 bits. */
+static int64_t mean_square_q18(int32_t before_q9, int32_t now_q9) {
+    const int32_t third_q32 = 0x55555556;
+    const int64_t sum_q9 = (int64_t)before_q9 + now_q9;
+    const int64_t square_q18 = sum_q9 * sum_q9 - (int64_t)before_q9 * now_q9;
+    return 8 * (int64_t)fixed_multiply_high((int32_t)(square_q18 >> 3), third_q32);
+}
+
+/* Trapezoidal rule. */
 static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sample) {
     const int32_t before_q9 = phase->current_q9, now_q9 = sample->current_q9;
     const int32_t twice_q9 = before_q9 + now_q9;
@@ -126,7 +135,7 @@ static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sa
     phase->applied_q39 += fixed_product(twice_q9, fixed_subtract(flux_q29, phase->flux_q29));
     phase->table_q39 += fixed_product(twice_q9, fixed_subtract(sample->table_q29, phase->table_q29));
     phase->charge_q10 += twice_q9 * periods;
-    phase->square_q18 += ((int64_t)twice_q9 * twice_q9 - (int64_t)before_q9 * now_q9) / 3 * periods;
+    phase->square_q18 += mean_square_q18(before_q9, now_q9) * periods;
     phase->current_q9 = now_q9;
     phase->flux_q29 = flux_q29;
     phase->table_q29 = sample->table_q29;
