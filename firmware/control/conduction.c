@@ -426,8 +426,6 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         break;
     case 3:
         state->sharing = sharing_for_torque(tables, state);
-        break;
-    case 4:
         limit_torque(parameters, state, sample);
         set_interval(parameters, state);
         break;

@@ -142,7 +142,7 @@ typedef struct {
     uint32_t on, off;
 } conduction_sharing_t;
 
-#define CONDUCTION_STEPS 6   /* of an update */
+#define CONDUCTION_STEPS 5   /* of an update */
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
 typedef struct {

@@ -255,12 +255,14 @@ def _within(row: ParameterDefinition, value: float) -> float:
 def _torque_max(machine: Machine, data: dict[str, Any]) -> tuple[float, str]:
     """torque_max_Nm and its formula."""
     peak_Nm = data["torque_peak_Nm"]
-    if "torque_peak_Nm" in machine.drive or "torque_rated_Nm" in machine.drive:
+    # A DC link has room for the fields of torque_peak_Nm (fold_back.py).
+    if machine.dc_link is not None or "torque_peak_Nm" in machine.drive or "torque_rated_Nm" in machine.drive:
         return peak_Nm, "torque_peak_Nm"
     limit_A = machine.drive_parameters.get("current_limit_A", data["current_peak_A"])
     window_Nm = WINDOW_SHARE * smooth_torque_Nm(machine.magnetics, machine.phases, limit_A)
-    return max(peak_Nm, window_Nm), (f"{WINDOW_SHARE:g} * least torque over a stroke of all phases at current_limit_A, "
-                                     "at least torque_peak_Nm; torque_peak_Nm where the file states torques")
+    return max(peak_Nm, window_Nm), (
+        f"{WINDOW_SHARE:g} * least torque over a stroke of all phases at current_limit_A, at least torque_peak_Nm; "
+        "torque_peak_Nm where the file states torques or has a DC link")
 
 
 def _commutation_deg(machine: Machine, data: dict[str, Any]) -> tuple[float, float]:

@@ -120,7 +120,7 @@ def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse, window: Sh
         largest_deg = np.array([-of.lead_deg[half, first:], of.end_deg[half, first:]])
         follower = _Follower(phase, machine.phases, half, np.tile(speed_rad_s, len(PARTS)))
         choices = follower.operations(wanted_Nm, pulse_deg, np.tile(largest_deg, len(PARTS)),
-                                      window.at_base_speed_deg(half == 1, wanted_Nm))
+                                      np.tile(window.pulse_deg[half][:, None], len(wanted_Nm)))
         angles_deg, reference_Nm = _chosen(choices, largest_deg)
         ripple = (reference_Nm.ravel() / wanted_Nm - 1.0) * part
         ripple = np.where(ripple > -_LOWERED_LEAST, np.maximum(ripple, 0.0), ripple)

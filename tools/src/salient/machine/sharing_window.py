@@ -26,6 +26,8 @@ PARTS = (0.25, 0.5, 0.75, 1.0)
 SPEEDS = 2
 """Standstill and base speed, as MACHINE_SHARING_SPEEDS."""
 
+_PULSE_PART = 0.6
+"""Part of the peak torque for which the window of the pulses has the least current."""
 _STEP_DEG = 2.0
 """Divides a stroke."""
 _HALF = int(180 / _STEP_DEG)
@@ -61,10 +63,10 @@ class SharingWindow:
     window_deg: np.ndarray
     """(2, SPEEDS, PARTS, 2): motoring and braking; standstill and base speed; part; turn-on and turn-off."""
 
-    def at_base_speed_deg(self, braking: bool, torque_Nm: np.ndarray) -> np.ndarray:
-        """(2, len(torque_Nm)): turn-on and turn-off for torques, as the firmware finds them."""
-        parts_Nm = np.array(PARTS) * self.torque_Nm
-        return np.array([np.interp(torque_Nm, parts_Nm, angle_deg) for angle_deg in self.window_deg[int(braking), 1].T])
+    pulse_deg: np.ndarray
+    """(2, 2): motoring and braking; turn-on and turn-off of the window that the pulses for parts of the torque above
+    base speed are found from, one for all torques: with windows that begin earlier for less torque, braking would
+    return the energy of wide windows to a small DC link at once."""
 
 
 def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
@@ -81,7 +83,8 @@ def sharing_window(machine: Machine, data: DriveData) -> SharingWindow:
     for braking in (False, True):
         of_half_deg = 180.0 - found_deg[..., ::-1] if braking else found_deg
         window_deg.append([of_half_deg[:, 1], _earlier_deg(phases, braking, base_rad_s, of_half_deg[:, 0], parts_Nm)])
-    return SharingWindow(torque_Nm, np.array(window_deg))
+    pulse_deg = least_current_deg(machine.magnetics, machine.phases, _PULSE_PART * data.torque_peak_Nm, limit_A, 0.0)
+    return SharingWindow(torque_Nm, np.array(window_deg), np.array([pulse_deg, 180.0 - pulse_deg[::-1]]))
 
 
 # --- speed ----------------------------------------------------------------------------------------------------------
