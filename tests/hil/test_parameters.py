@@ -39,7 +39,7 @@ def test_written_value_is_read_back(bench):
 
 def test_drive_has_the_table_of_the_reference_page(bench):
     machine_defined = {"controller", "inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "winding_current_A",
-                       "winding_time_constant_s", "switch_current_A"}
+                       "winding_time_constant_s", "switch_current_A", "bp_error_scale_Nm"}
     table = read_table()
     rows = list(bench.drive.parameters.rows.values())
     assert [(r.index, r.name, r.unit, r.fraction_bits) for r in rows] == [
