@@ -15,6 +15,9 @@
 #define FORGET_BITS 11
 #define SAMPLES_MIN 5120u
 #define SAMPLES_EACH 256u
+/* Samples of one conduction: the begin of a longer one is forgotten (e^-2) before its end, and the courses of the rest
+ * are alike. */
+#define CONDUCTION_MAX (2u << FORGET_BITS)
 
 /* Flux linkages in the sums, Wb: Q19, so that 2^13 squares of 4 Wb fit; D, which is smaller, Q23. */
 #define COARSER 10
@@ -33,6 +36,10 @@ static int32_t flux_at(const machine_tables_t *tables, uint32_t angle, int32_t c
 COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *tables, const flux_angle_sample_t *sample) {
     if (sample->flux_q29 <= 0) {
         flux_angle->resistive_q29 = flux_angle->time_q29 = 0;
+        if (flux_angle->conduction_samples > 0) {
+            flux_angle->last_conduction_samples = flux_angle->conduction_samples;
+        }
+        flux_angle->conduction_samples = 0;
         return false;
     }
     flux_angle->resistive_q29 = fixed_add(flux_angle->resistive_q29, sample->resistive_q29);
@@ -57,10 +64,14 @@ COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *table
         }
     }
     flux_angle->samples++;
+    flux_angle->conduction_samples++;
     return flux_angle->samples >= SAMPLES_MIN && flux_angle->samples % SAMPLES_EACH == 0;
 }
 
 COLD int32_t flux_angle_solve(const flux_angle_t *flux_angle) {
+    if (flux_angle->conduction_samples > CONDUCTION_MAX || flux_angle->last_conduction_samples > CONDUCTION_MAX) {
+        return 0;
+    }
     unsigned shift = 0;
     for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
         while (flux_angle->sum[row][row] >> shift >> SCALED_BITS != 0) {

@@ -11,7 +11,8 @@
  * for each phase by itself; old samples are forgotten. The normal equations are solved by elimination, delta last.
  * Derived here. With flux linkage wrong by 10 percent, resistance by 50 and a drop of 1.7 V the angle is right to 0.05
  * degrees (tests/unit/control/test_flux_angle.cpp); an error of the tables' shape, which none of the courses has, shows
- * as an angle.
+ * as an angle. At low speed, where a conduction lasts longer than its samples are remembered, nothing
+ * is told.
  */
 #ifndef CONTROL_FLUX_ANGLE_H
 #define CONTROL_FLUX_ANGLE_H
@@ -29,6 +30,7 @@
 typedef struct {
     int64_t sum[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES]; /* of products, upper triangle */
     uint32_t samples;                                    /* modulo 2^32 */
+    uint32_t conduction_samples, last_conduction_samples; /* of this conduction, 0 between two, and the last one */
     int32_t resistive_q29;                               /* integral of R i since the phase has conducted, Wb, Q2.29 */
     int32_t time_q29;                                    /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
 } flux_angle_t;
@@ -47,7 +49,8 @@ typedef struct {
 /* One sample; true when the sums are to be solved. [background] */
 bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *tables, const flux_angle_sample_t *sample);
 
-/* Misalignment, 2^-32 electrical rev; 0 when the samples do not tell it from the other errors. [background] */
+/* Misalignment, 2^-32 electrical rev; 0 when the samples do not tell it from the other errors, or are those of a part
+ * of a conduction. [background] */
 int32_t flux_angle_solve(const flux_angle_t *flux_angle);
 
 #endif

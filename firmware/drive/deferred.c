@@ -210,11 +210,13 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
                                         input->speed_correction_q22);
 }
 
-/* Between slow counts the flux linkage is compared at an angle of the model. */
+/* Between slow counts the flux linkage is compared at an angle of the model, and no ripple corrects what the shape of
+ * the tables errs by (misalignment.h): only what exceeds both is told. */
 static int32_t told_by_flux(const control_parameters_t *parameters, const deferred_t *deferred, int32_t misalignment) {
     const int32_t offset = deferred->misalignment.phase[deferred->misalignment.phase_index].offset;
     const int32_t uncertain = (int32_t)(slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts) *
-                                        parameters->commutation.rotor_poles);
+                                        parameters->commutation.rotor_poles) +
+                              (int32_t)(parameters->misalignment.probe_angle / 2);
     const int32_t error = fixed_subtract(misalignment, offset);
     return misalignment != 0 && fixed_abs(error) > uncertain
                ? fixed_subtract(misalignment, error > 0 ? uncertain : -uncertain)

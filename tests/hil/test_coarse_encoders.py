@@ -86,7 +86,7 @@ def test_a_rotor_is_held_within_two_counts(tmp_path, machine, controller, bits):
 
 
 def test_a_speed_at_which_the_drive_would_swing_is_refused_by_its_lowest_speed(make_bench):
-    for controller, lowest in (("salient", "5.49"), ("traditional", "16.47")):
+    for controller, lowest in (("salient", "3.33"), ("traditional", "9.99")):
         bench = make_bench(machine="finite_element", controller=controller, encoder_bits=9)
         with pytest.raises(DriveError, match=f"encoder allows 0, or from {lowest} r/min on"):
             bench.drive.speed_reference_rpm = -2.0

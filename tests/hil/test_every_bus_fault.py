@@ -44,7 +44,7 @@ CASES = {
                   lambda b: b.telemetry["transmit_error_counter"].value.max() > 0 and status_frames(b) == 10),
     "delayed": ({"frame_delay_us": 2000, "frame_fault_sender": OF_DRIVE, "frame_fault": DELAYED}, 0.05,
                 lambda b: 0.002 < latest_delay_s(b) < 0.004),
-    "duplicated": ({"frame_fault_per_mille": 300, "frame_fault_sender": OF_DRIVE, "frame_fault": DUPLICATED}, 0.05,
+    "duplicated": ({"frame_fault_per_mille": 500, "frame_fault_sender": OF_DRIVE, "frame_fault": DUPLICATED}, 0.05,
                    lambda b: 11 <= status_frames(b) <= 19),
     "disconnected": ({"bus_connection": 0}, 0.05, lambda b: status_frames(b) == 0),
     "bus_off": ({"transmit_error_counter": 256}, 0.21, lambda b: b.telemetry["bus_off_count"].last == 1),

@@ -16,7 +16,7 @@ RIPPLE = [
     ("saturating", 40_000, 600, 0.02, 0.06), ("saturating", 20_000, 150, 0.02, 0.05),
     ("saturating", 100_000, 150, 0.003, 0.012), ("linear_cosine", 40_000, 150, 0.006, 0.02),
     ("linear_cosine", 20_000, 150, 0.015, 0.05), ("linear_trapezoid", 40_000, 150, 0.03, 0.08),
-    ("finite_element", 40_000, 150, 0.01, 0.035), ("finite_element", 20_000, 150, 0.02, 0.09),
+    ("finite_element", 40_000, 150, 0.035, 0.09), ("finite_element", 20_000, 150, 0.02, 0.09),
     ("finite_element", 40_000, 600, 0.05, 0.13),
 ]  # fmt: skip
 

@@ -321,7 +321,7 @@ def test_load_that_drives_leaves_the_torque_to_accelerate_with_a_coarse_encoder(
 
 def test_controller_is_changed_over_can_between_runs(bench):
     # Standard deviation of the true torque under a steady load, N m.
-    unevenness_Nm = {"traditional": (0.4, 1.2), "paper": (0.03, 0.15), "salient": (0.001, 0.015)}
+    unevenness_Nm = {"traditional": (0.4, 1.2), "paper": (0.003, 0.015), "salient": (0.001, 0.015)}
     numbers = {"traditional": 0, "paper": 1, "salient": 2}
     for name in ("traditional", "salient", "paper", "salient", "traditional"):
         bench.drive.parameters["controller"] = numbers[name]

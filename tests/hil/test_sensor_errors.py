@@ -140,7 +140,7 @@ def test_starts_and_holds_speed_under_load(make_bench, controller, name):
     ("current_sensor_offset_A", 0.5, lambda true_A: true_A + 0.5),
     ("current_sensor_offset_A", -0.5, lambda true_A: np.maximum(true_A - 0.5, 0.0)),
     ("current_sensor_gain", 1.05, lambda true_A: 1.05 * true_A),
-    ("current_sensor_limit_A", 25.0, lambda true_A: np.minimum(true_A, 25.0)),
+    ("current_sensor_limit_A", 30.0, lambda true_A: np.minimum(true_A, 30.0)),
 ])  # fmt: skip
 def test_measured_currents_have_the_injected_error(bench, variable, value, wrong):
     start_loaded(bench)

@@ -177,7 +177,7 @@ def test_other_inertia_is_no_gain_of_the_current_sensors(make_bench, inertia):
 
 # --- a wrong angle --------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(("machine", "early"), [("saturating", (0.06, 0.1)), ("finite_element", (0.25, 0.4))])
+@pytest.mark.parametrize(("machine", "early"), [("saturating", (0.06, 0.1)), ("finite_element", (0.14, 0.25))])
 @pytest.mark.parametrize("offset_deg", [1.0, -1.0])
 def test_displaced_encoder_is_a_ripple_for_a_second_but_no_error_of_the_mean_torque(make_bench, machine, early,
                                                                                      offset_deg):

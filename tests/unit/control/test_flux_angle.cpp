@@ -108,13 +108,23 @@ TEST_F(FluxAngle, is_not_solved_in_the_first_half_second) {
     EXPECT_GT(solutions, 0);
 }
 
+TEST_F(FluxAngle, is_unknown_while_a_conduction_lasts_longer_than_it_is_remembered) {
+    rpm = 5.0;
+    misalignment_deg = 0.3;
+    run(1.5);
+    solutions = 0;
+    run(4.0);
+    EXPECT_GT(solutions, 10);
+    EXPECT_EQ(solved_deg, 0.0);
+}
+
 TEST_F(FluxAngle, is_unknown_without_a_course_of_its_own) {
     for (int k = 0; k < 4096; k++) {
         const flux_angle_sample_t constant = {
             .angle = 0xb0000000u,
             .misalignment = 0,
             .current_q9 = 10 * 512,
-            .flux_q29 = 1 << 26,
+            .flux_q29 = k % 1000 == 0 ? 0 : 1 << 26,
             .table_q29 = 1 << 25,
             .resistive_q29 = 0,
             .time_q29 = 0,

@@ -34,7 +34,7 @@ TORQUE_ERROR = 0.02
 HASTE = {"salient": 1.0, "paper": 2.0, "traditional": 3.0}
 """How much closer the counts are to be, by controller."""
 
-RATED_PART = 0.5
+RATED_PART = 0.75
 """Part of the rated torque for which both are taken."""
 
 _ANGLES_DEG = np.arange(180.0, 361.0)
