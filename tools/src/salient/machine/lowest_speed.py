@@ -42,10 +42,11 @@ _CURRENTS = 160
 
 
 def lowest_speed_rpm(machine: str, encoder_bits: int, controller: str) -> float:
-    """Of a machine by its name or file; 0 with an encoder that is not coarse, or ideal (0 bits)."""
+    """Of a machine by its name or file, rounded up to 0.01 r/min, as messages name it; 0 with an encoder that is not
+    coarse, or ideal (0 bits)."""
     if not 0 < encoder_bits <= COARSE_BITS:
         return 0.0
-    return HASTE[controller] * _lowest_rpm(machine, encoder_bits)
+    return math.ceil(100.0 * HASTE[controller] * _lowest_rpm(machine, encoder_bits)) / 100.0
 
 
 @lru_cache
