@@ -5,9 +5,6 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* 0.01 rad, 2^-32 rev. */
-#define PROBE_ANGLE 6835653
-
 #define MEAN_1_S 10
 #define FILTER_GAIN_MAX_Q16 65535 /* largest below one */
 #define SETTLE_MS 150
@@ -31,7 +28,7 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
     const uint32_t phase_rate_hz = update_rate_hz / settings->phases;
     const uint32_t common_rate_hz = settings->control_rate_hz / settings->periods_per_common_update;
-    const uint32_t probe_angle = PROBE_ANGLE * settings->rotor_poles;
+    const uint32_t probe_angle = MISALIGNMENT_PROBE_ANGLE * settings->rotor_poles;
     return (misalignment_parameters_t){
         .probe_angle = probe_angle,
         .rate_q30 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 30, phase_rate_hz),

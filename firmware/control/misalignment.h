@@ -49,6 +49,10 @@
 #include "control/machine_tables.h"
 #include "hal.h"
 
+#define MISALIGNMENT_PROBE_ANGLE 6835653 /* 0.01 rad, 2^-32 rev */
+/* What the flux linkage may err by with the shape of the tables: 0.29 degrees, 2^-32 rev. */
+#define MISALIGNMENT_SHAPE_ANGLE (MISALIGNMENT_PROBE_ANGLE / 2)
+
 typedef struct {
     uint32_t probe_angle;    /* 0.01 rad mechanical, 2^-32 electrical rev; s_j is the torque change over twice that */
     int32_t rate_q30;        /* rate times the update interval of a phase, Q1.30; 0: no learning */

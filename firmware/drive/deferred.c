@@ -214,13 +214,10 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
  * the tables errs by (misalignment.h): only what exceeds both is told. */
 static int32_t told_by_flux(const control_parameters_t *parameters, const deferred_t *deferred, int32_t misalignment) {
     const int32_t offset = deferred->misalignment.phase[deferred->misalignment.phase_index].offset;
-    const int32_t uncertain = (int32_t)(slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts) *
-                                        parameters->commutation.rotor_poles) +
-                              (int32_t)(parameters->misalignment.probe_angle / 2);
-    const int32_t error = fixed_subtract(misalignment, offset);
-    return misalignment != 0 && fixed_abs(error) > uncertain
-               ? fixed_subtract(misalignment, error > 0 ? uncertain : -uncertain)
-               : 0;
+    const uint32_t angle = slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts);
+    const int32_t uncertain = (int32_t)((angle + MISALIGNMENT_SHAPE_ANGLE) * parameters->commutation.rotor_poles);
+    const int32_t excused = fixed_clamp(fixed_subtract(misalignment, offset), -uncertain, uncertain);
+    return misalignment != 0 ? fixed_subtract(misalignment, excused) : 0;
 }
 
 /* While counts are slow the ripple teaches nothing; the gains of the coming counts by the slope of the torque. */
@@ -414,6 +411,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
                              input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
             !deferred->periodic_load.engaged;
         step_torque_offset(parameters, deferred, input);
+        set_speed_law(parameters, deferred);
         moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
                            deferred->periodic_load.engaged);
         if (stroke_mean_to_review(&deferred->stroke_mean)) {
@@ -433,7 +431,6 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
         periodic_load_review(&deferred->periodic_load);
         identify_inertia(parameters, deferred, input);
         move_conduction(parameters, deferred, input);
-        set_speed_law(parameters, deferred);
         break;
     default:
         average_torque(deferred, input->torque_sum_q24);

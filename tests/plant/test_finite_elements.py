@@ -157,18 +157,20 @@ def test_steinmetz_formula_approximates_the_measured_loss():
     assert 1.0 < ratio.max() < 1.10
 
 
-@pytest.mark.parametrize("controller", ["traditional", "paper"])
-def test_drive_with_default_limits_compensates_a_load_step_on_this_machine(make_bench, controller):
+# Measured: it falls to 126 and 145 r/min.
+@pytest.mark.parametrize(("controller", "lowest_rpm", "most_A"), [
+    ("traditional", (105, 135), (50, 72)),  # chopping at 52 A, two periods late
+    ("paper", (140, 148), (35, 52)),
+])
+def test_drive_with_default_limits_compensates_a_load_step_on_this_machine(make_bench, controller, lowest_rpm, most_A):
     bench = make_bench(machine="finite_element", controller=controller)
     bench.drive.speed_reference_rpm = 150
     bench.at(0.13).load_torque_Nm = 8
     bench.run_for(0.5)
     assert bench.drive.fault == "none"
     speed_rpm = bench.truth["speed_rpm"]
-    # Measured: it falls to 126 and 124 r/min.
-    assert 105 < speed_rpm.between(0.13, 0.5).value.min() < 135
+    assert lowest_rpm[0] < speed_rpm.between(0.13, 0.5).value.min() < lowest_rpm[1]
     steady_rpm = speed_rpm.between(0.3, 0.5).value
     assert steady_rpm.min() > 147 and steady_rpm.max() < 153
-    # Chopping at 52 A, two periods late.
     currents_A = [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].value.max() for phase in "abcd"]
-    assert 50 < max(currents_A) < 72
+    assert most_A[0] < max(currents_A) < most_A[1]

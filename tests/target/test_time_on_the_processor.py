@@ -166,8 +166,10 @@ def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, c
     bench, first = run()
     overruns, worst_us = processor(bench, "late_interrupts"), processor(bench, "worst_us")
     print(f"{controller}, {slow}: {overruns:g} overruns, longest {worst_us:g} us")
-    assert 1 <= overruns < 300
-    assert period_us < worst_us < 10 * period_us
+    # The deferred interrupt finds no time while every control interrupt still ends in time.
+    assert overruns < 300
+    assert bench.telemetry["skipped_periods"].last >= 8
+    assert 0.5 * period_us < worst_us < 10 * period_us
     assert processor(bench, "used_us") < period_us  # in fault the deadlines are met again
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
     assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"

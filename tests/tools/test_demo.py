@@ -131,10 +131,10 @@ def test_scenario_files_select_the_controllers(controllers, tmp_path, monkeypatc
             demo.EXPERIMENTS, controllers)
 
 
-def test_ripple_of_the_paper_controller_is_below_that_of_hysteresis(demo_metrics):
+def test_ripple_of_the_paper_controller_is_below_the_published_one(demo_metrics):
     ripple = {controller: of["torque_ripple"] for controller, of in demo_metrics["load_step_150"].items()}
     assert 0.3 < ripple["traditional"] < 1.6
-    assert PAPER["load_step_150"]["paper"]["torque_ripple"] < ripple["paper"] < ripple["traditional"]
+    assert 0.005 < ripple["paper"] < PAPER["load_step_150"]["paper"]["torque_ripple"]
 
 
 def readme_table(first_cell):
@@ -193,8 +193,7 @@ def test_other_machines_are_within_the_same_bounds(machine, settles_s, tmp_path)
     # The reaching law of the finite-element machine, steep for salient, is that of the paper's controller, too.
     assert 0.0 <= start["overshoot_percent"] <= (1.0 if machine == "finite_element" else 0.5)
     assert 0.0 < step["paper"]["recovery_time_s"] <= 0.010
-    assert PAPER["load_step_150"]["paper"]["torque_ripple"] < step["paper"]["torque_ripple"]
-    assert step["paper"]["torque_ripple"] < step["traditional"]["torque_ripple"]
+    assert 0.005 < step["paper"]["torque_ripple"] < 0.25 * step["traditional"]["torque_ripple"]
     assert 0.15 < step["traditional"]["torque_ripple"] < 0.8
     (row,) = (cells for name, cells in readme_table("`saturating`").items() if name.startswith(f"`{machine}`"))
     assert_shown(row, {controller: of["torque_ripple"] for controller, of in step.items()})

@@ -43,7 +43,9 @@ def test_bundled_machines_are_in_si_units_with_the_database_and_defaults_of_the_
     assert scaling.exponents == Exponents()
     assert scaling.dbc() == DRIVE_DBC.read_text()
     of_machine = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "speed_kp", "speed_ki", "smc_k", "smc_delta",
-                      "winding_current_A"}
+                  "winding_current_A", "bp_error_scale_Nm"}
+    if path.stem == "finite_element":  # poles overlap later than the paper's
+        of_machine |= {"turn_on_angle_deg", "turn_off_angle_deg", "outgoing_off_angle_deg", "hand_over_angle_deg"}
     for row, raw in zip(read_table(), scaling.raw_parameters(), strict=True):
         assert raw == row.default or row.name in of_machine, row.name
     assert scaling.fraction_bits() == [row.fraction_bits for row in read_table()]

@@ -123,7 +123,7 @@ def test_loads_profiles_and_seeds_are_columns(scenario, tmp_path):
     found = rows(tmp_path)
     assert [(row["load_Nm"], row["seed"]) for row in found] == [("1.0", "1"), ("1.0", "2"), ("3.0", "1"), ("3.0", "2")]
     assert {row["controller"] for row in found} == {"paper"}
-    assert len({row["final_speed_rpm"] for row in found}) == 4  # noise by seed, torque by load
+    assert len({row["mean_torque_Nm"] for row in found}) == 4  # noise by seed, torque by load
 
 
 def test_failed_run_is_a_row_and_the_exit_code(scenario, tmp_path, capsys):
