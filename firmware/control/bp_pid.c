@@ -3,7 +3,6 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "fixed/formats.h"
-#include "fixed/sigmoid.h"
 
 #define ERROR_BITS 17 /* Q16, saturated to -1..1 - 2^-16 */
 #define DUTY_BITS 24  /* Q23, saturated to -1..1 - 2^-23, which rounds to 1 in Q15 */
@@ -15,10 +14,10 @@ void bp_pid_clear_telemetry(bp_pid_t *pid) {
     }
 }
 
-void bp_pid_reset(const bp_pid_parameters_t *parameters, bp_pid_t *pid) {
-    bp_network_reset(&pid->network, parameters->seed);
+void bp_pid_reset(bp_pid_t *pid) {
     pid->error_q16 = 0;
     pid->error_difference_q16 = 0;
+    pid->sample.learns = false;
     bp_pid_clear_telemetry(pid);
 }
 
@@ -35,40 +34,29 @@ void bp_pid_set_error(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int3
     pid->error_q16 = scaled_error_q16(parameters, torque_error_q24);
 }
 
-int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, int32_t torque_error_q24) {
-    static const int32_t half_output_q27[BP_OUTPUTS] = {0}; /* f = 0: g = 1/2 */
-    const bool learning = parameters->mode == BP_PID_LEARNING;
-    const int32_t *output_q27 = half_output_q27;
-
+int32_t bp_pid_step(const bp_pid_parameters_t *parameters, bp_pid_t *pid, const int32_t gain_q24[BP_OUTPUTS],
+                    int32_t torque_error_q24) {
     const int32_t error_q16 = scaled_error_q16(parameters, torque_error_q24);
     const int32_t error_difference_q16 = error_q16 - pid->error_q16;
     const int32_t second_difference_q16 = error_difference_q16 - pid->error_difference_q16;
     pid->error_q16 = error_q16;
     pid->error_difference_q16 = error_difference_q16;
-    const int32_t term_q31[3] = {
-        fixed_saturate_bits(error_difference_q16, ERROR_BITS) * (1 << 15),
-        error_q16 * (1 << 15),
-        fixed_saturate_bits(second_difference_q16, ERROR_BITS) * (1 << 15),
-    };
-    if (learning || parameters->mode == BP_PID_FROZEN) {
-        const int32_t input_q27[BP_INPUTS] = {term_q31[0] >> 4, term_q31[1] >> 4, term_q31[2] >> 4};
-        bp_network_forward(&pid->network, input_q27);
-        output_q27 = pid->network.output_q27;
-    }
+    int32_t *term_q31 = pid->sample.term_q31;
+    term_q31[0] = fixed_saturate_bits(error_difference_q16, ERROR_BITS) * (1 << 15);
+    term_q31[1] = error_q16 * (1 << 15);
+    term_q31[2] = fixed_saturate_bits(second_difference_q16, ERROR_BITS) * (1 << 15);
 
     int32_t sum_q23 = pid->duty_q23; /* within 1 + 3 * 4 */
     UNROLL(3)
     for (unsigned l = 0; l < BP_OUTPUTS; l++) {
-        pid->gain_q24[l] = fixed_multiply_high(sigmoid_logistic_q28(output_q27[l]), parameters->scale_q28[l]);
-        sum_q23 = fixed_multiply_high_add(sum_q23, pid->gain_q24[l], term_q31[l]);
+        pid->gain_q24[l] = gain_q24[l];
+        sum_q23 = fixed_multiply_high_add(sum_q23, gain_q24[l], term_q31[l]);
     }
     const int32_t duty_q23 = fixed_saturate_bits(sum_q23, DUTY_BITS);
     pid->duty_q23 = duty_q23;
 
     /* Saturated at 2^16 - 1 or -2^16, whose complement is 2^16 - 1. */
     const bool at_limit = (error_q16 ^ error_q16 >> 31) == (1 << (ERROR_BITS - 1)) - 1;
-    if (learning && sum_q23 == duty_q23 && !at_limit) {
-        bp_network_learn(&parameters->network, &pid->network, error_q16, term_q31, term_q31);
-    }
+    pid->sample.learns = sum_q23 == duty_q23 && !at_limit;
     return (duty_q23 + (1 << 7)) >> 8;
 }

@@ -14,8 +14,8 @@
 /* Periods, as a power of two, over which the duty that an outgoing phase keeps is averaged. */
 #define RELEASED_SHIFT 2
 
-void pwm_ditc_reset(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc) {
-    bp_pid_reset(&parameters->pid, &ditc->pid);
+void pwm_ditc_reset(pwm_ditc_t *ditc) {
+    bp_pid_reset(&ditc->pid);
     ditc->regulated = COMMUTATION_NONE;
     ditc->released_q15 = ditc->incoming_torque = ditc->error_q24 = 0;
 }
@@ -170,7 +170,8 @@ static int32_t regulated_duty_q15(const pwm_ditc_parameters_t *parameters, pwm_d
     const int32_t factor_q16 = sample->plan->factor_q16;
     bp_pid_set_error(&parameters->pid, &ditc->pid, normalised_q24(ditc->error_q24, factor_q16));
     ditc->error_q24 = sample->error_q24;
-    const int32_t duty_q15 = bp_pid_step(&parameters->pid, &ditc->pid, normalised_q24(sample->error_q24, factor_q16));
+    const int32_t error_q24 = normalised_q24(sample->error_q24, factor_q16);
+    const int32_t duty_q15 = bp_pid_step(&parameters->pid, &ditc->pid, sample->gain_q24, error_q24);
     const int32_t forward_q15 = fixed_multiply_high(gained, sample->plan->duty_per_torque_q47);
     return ditc->regulated == active ? duty_q15 : duty_q15 - forward_q15;
 }

@@ -80,6 +80,7 @@ typedef struct {
     const int32_t *current_q9; /* A, Q7.9, by phase */
     const int32_t *torque;     /* by phase, unit of the tables */
     int32_t error_q24;         /* reference - total torque, N m, Q7.24 */
+    const int32_t *gain_q24;   /* of the BP-PID, bp_pid_step() */
     const pwm_ditc_plan_t *plan;
 } pwm_ditc_sample_t;
 
@@ -109,8 +110,8 @@ typedef struct {
 pwm_ditc_plan_t pwm_ditc_plan(const pwm_ditc_parameters_t *parameters, const machine_tables_t *tables,
                               const pwm_ditc_plan_sample_t *sample);
 
-/* Initial weights; no phase regulated. */
-void pwm_ditc_reset(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc);
+/* No phase regulated. */
+void pwm_ditc_reset(pwm_ditc_t *ditc);
 
 /* One sample: duty of each phase, Q1.15, -32768..32768, from its last ones. Duties are clamped, products of 32 bits
  * rounded to nearest. */

@@ -26,12 +26,24 @@ typedef struct {
     int32_t trim_q24;         /* N m, Q7.24 */
 } torque_trim_t;
 
-/* Trim 0, initial weights; past references: the given one, N m, Q7.24. */
-void torque_trim_reset(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24);
+/* Trim 0; past references: the given one, N m, Q7.24. */
+void torque_trim_reset(torque_trim_t *trim, int32_t reference_q24);
 
-/* One sample: trimmed reference in N m, Q7.24. Reference and estimated torque at the sample in N m, Q7.24, any value;
- * voltage_limited keeps the trim constant. Sums saturate, the 64-bit product is rounded to nearest. */
-int32_t torque_trim_step(const torque_trim_parameters_t *parameters, torque_trim_t *trim, int32_t reference_q24,
-                         int32_t torque_q24, bool voltage_limited);
+/* torque_trim_step() of a trim that is not off. */
+int32_t torque_trim_correct(const torque_trim_parameters_t *parameters, torque_trim_t *trim,
+                            const int32_t gain_q24[BP_OUTPUTS], int32_t reference_q24, int32_t torque_q24,
+                            bool voltage_limited);
+
+/* One sample: trimmed reference in N m, Q7.24; without trim the reference. gain_q24: of the BP-PID, bp_pid_step().
+ * Reference and estimated torque at the sample in N m, Q7.24, any value; voltage_limited keeps the trim constant. Sums
+ * saturate, the 64-bit product is rounded to nearest. */
+static inline int32_t torque_trim_step(const torque_trim_parameters_t *parameters, torque_trim_t *trim,
+                                       const int32_t gain_q24[BP_OUTPUTS], int32_t reference_q24, int32_t torque_q24,
+                                       bool voltage_limited) {
+    if (parameters->pid.mode == BP_PID_OFF) {
+        return reference_q24;
+    }
+    return torque_trim_correct(parameters, trim, gain_q24, reference_q24, torque_q24, voltage_limited);
+}
 
 #endif

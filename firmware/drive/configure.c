@@ -422,6 +422,8 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .speed_law = controller.speed_law,
         .torque_law = controller.torque_law,
+        .has_bp_pid = controller.torque_law == TORQUE_LAW_DUTY ||
+                      (controller.torque_law == TORQUE_LAW_PREDICTIVE && values[PARAMETER_BP_TRIM_MODE] != BP_PID_OFF),
         .speed_reference_min_q22 = controller.four_quadrant ? INT32_MIN : 0,
         .interleaved_pwm = controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2,
         .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,

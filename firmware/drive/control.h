@@ -18,6 +18,7 @@
 #include <stdint.h>
 
 #include "control/applied_flux.h"
+#include "control/bp_tuner.h"
 #include "control/commutation.h"
 #include "control/conduction.h"
 #include "control/count_course.h"
@@ -105,6 +106,7 @@ typedef struct {
     encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
     int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
     bool scale_by_shaft;          /* and by the acceleration of the shaft, shaft_torque.h */
+    bool has_bp_pid;              /* torque control by duty, or predictive with a trim */
     degraded_parameters_t degraded;
     thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
     temperature_parameters_t temperature;
@@ -137,7 +139,6 @@ typedef struct {
 
 /* State of the deferred step, which alone writes it. */
 typedef struct {
-    deferred_response_t response;
     bool started;        /* the first input has initialised the protection */
     uint32_t generation; /* of the last input */
     protection_deferred_t protection;
@@ -164,6 +165,8 @@ typedef struct {
     bool approaches_reference;        /* until then, and for some more */
     slow_counts_t slow_counts;
     count_course_t count_course;
+    bp_tuner_t tuner;
+    deferred_response_t response;
 } deferred_t;
 
 /* Half a millisecond in which the observer may slip. */

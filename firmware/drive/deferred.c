@@ -58,19 +58,33 @@ static void hand_over_bandwidth(control_state_t *state, const control_measuremen
     state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
 }
 
-static void hand_over_predictive(const control_state_t *state, const control_measurement_t *measured,
-                                 deferred_input_t *input) {
+/* A sample is learned from once. Word by word: a copy of the structure takes registers that each step had to save. */
+static void hand_over_pid(bp_pid_t *pid, deferred_input_t *input) {
+    UNROLL(3)
+    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+        input->pid.term_q31[l] = pid->sample.term_q31[l];
+    }
+    input->pid.learns = pid->sample.learns;
+    pid->sample.learns = false;
+}
+
+static void hand_over_predictive(const control_parameters_t *parameters, control_state_t *state,
+                                 const control_measurement_t *measured, deferred_input_t *input) {
     input->load_torque_q24 = state->observer.load_torque_q24;
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->torque_sum_q24 = measured->torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
+    if (parameters->has_bp_pid) {
+        hand_over_pid(&state->trim.pid, input);
+    }
 }
 
-static void hand_over_duty(const control_parameters_t *parameters, const control_state_t *state,
+static void hand_over_duty(const control_parameters_t *parameters, control_state_t *state,
                            const control_measurement_t *measured, deferred_input_t *input) {
     const unsigned regulated = state->duty.regulated;
     input->regulated_angle = commutation_angle(&parameters->commutation, &measured->commutation, regulated);
     input->regulated_current_q9 = measured->current_q9[regulated];
+    hand_over_pid(&state->duty.pid, input);
 }
 
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
@@ -96,7 +110,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
         hand_over_bandwidth(state, measured, input);
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        hand_over_predictive(state, measured, input);
+        hand_over_predictive(parameters, state, measured, input);
     } else if (parameters->torque_law == TORQUE_LAW_DUTY && state->duty.regulated < HAL_PHASES_MAX) {
         hand_over_duty(parameters, state, measured, input);
     }
@@ -444,12 +458,31 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
     }
 }
 
+/* The network learns while the drive runs, and begins anew with each run. */
+NOINLINE static void tune_pid(const control_parameters_t *parameters, deferred_t *deferred,
+                              const deferred_input_t *input, bool reset, deferred_results_t *results) {
+    const bp_pid_parameters_t *pid =
+        parameters->torque_law == TORQUE_LAW_DUTY ? &parameters->duty.pid : &parameters->trim.pid;
+    bp_tuner_t *tuner = &deferred->tuner;
+    if (reset) {
+        bp_tuner_reset(pid, tuner);
+    } else if (input->run) {
+        bp_tuner_step(pid, tuner, &input->pid);
+    }
+    UNROLL(3)
+    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+        results->pid_gain_q24[l] = tuner->gain_q24[l];
+    }
+}
+
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
     const deferred_input_t *input = &state->deferred_request.input;
     deferred_t *deferred = &state->deferred;
     deferred_results_t *results = deferred_buffer(&deferred->response);
     IN_REGISTER(results);
-    const bool reset = deferred->generation != input->generation; /* as in the first step: control_prepare */
+    const uint32_t changed = deferred->generation ^ input->generation;
+    const bool reset = changed != 0; /* as in the first step: control_prepare */
+    const bool run_reset = (changed & RUN_MASK) != 0;
     if (reset) {
         follow_resets(parameters, deferred, input);
     }
@@ -477,9 +510,13 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     } else if (!reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input, state->flux_misalignment);
     }
+    if (parameters->has_bp_pid) {
+        tune_pid(parameters, deferred, input, run_reset, results);
+    }
     results->observer = deferred->inertia.laws.observer;
     results->predictive.conduction = deferred->conduction.latest;
-    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+    UNROLL(4)
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }
 }

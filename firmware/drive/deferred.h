@@ -10,6 +10,7 @@
  *   offset       mean torque error -> torque reference                                     torque_offset.h
  *   periodic     load torque that repeats with every turn -> torque reference, observer    periodic_load.h
  *   learn        misalignment of each phase                                                misalignment.h
+ *   network      sample of the BP-PID -> its gains                                          bp_tuner.h
  *   inertia      torque and acceleration in transients -> laws of the inertia              inertia.h
  *
  * The control interrupt ends with the hand-over of its values; the deferred interrupt makes the step, and its results

@@ -18,6 +18,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/bp_pid.h"
 #include "control/conduction.h"
 #include "control/ditc_hysteresis.h"
 #include "control/load_observer.h"
@@ -45,6 +46,7 @@ typedef struct {
     /* With torque control by the duty of the BP-PID only: of the phase that it regulates. */
     uint32_t regulated_angle;     /* 2^-32 electrical rev */
     int32_t regulated_current_q9; /* A, Q7.9 */
+    bp_pid_sample_t pid;          /* with a BP-PID only */
     /* With predictive torque control only. */
     int32_t load_torque_q24;      /* observer, N m, Q7.24 */
     int32_t speed_correction_q22; /* observer, rad/s, Q9.22 */
@@ -80,6 +82,8 @@ typedef struct {
     slow_counts_results_t slow_counts;
     ditc_hysteresis_limit_t limit; /* without predictive torque control only */
     pwm_ditc_plan_t duty;          /* with torque control by the duty of the BP-PID only */
+    /* With a BP-PID only: of bp_tuner_t; until the next step after a reset 0, with which it keeps its duty. */
+    int32_t pid_gain_q24[BP_OUTPUTS];
 } deferred_results_t;
 
 typedef struct {

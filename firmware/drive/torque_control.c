@@ -10,11 +10,11 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
     case TORQUE_LAW_HYSTERESIS:
         break;
     case TORQUE_LAW_DUTY:
-        pwm_ditc_reset(&parameters->duty, &state->duty);
+        pwm_ditc_reset(&state->duty);
         break;
     case TORQUE_LAW_PREDICTIVE:
         predictive_torque_reset(&state->predictive);
-        torque_trim_reset(&parameters->trim, &state->trim, 0);
+        torque_trim_reset(&state->trim, 0);
         break;
     }
 }
@@ -65,6 +65,7 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
         .current_q9 = measured->current_q9,
         .torque = measured->torque,
         .error_q24 = torque_error_q24(state, measured),
+        .gain_q24 = deferred->pid_gain_q24,
         .plan = &deferred->duty,
     };
     commutation_t ahead = {.electrical = measured->commutation.electrical + deferred->duty.lead};
@@ -81,8 +82,9 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     /* The duties act from one to two periods after the sample: the observer has predicted the first period. */
     const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
     const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
-    const int32_t trimmed_q24 = torque_trim_step(&parameters->trim, &state->trim, state->torque_reference_q24,
-                                                 measured->torque_sum_q24, voltage_limited);
+    const int32_t trimmed_q24 =
+        torque_trim_step(&parameters->trim, &state->trim, deferred->pid_gain_q24, state->torque_reference_q24,
+                         measured->torque_sum_q24, voltage_limited);
     const table_scale_factors_t *scale = &state->table_scale;
     const conduction_t *conduction =
         conduction_angles(&parameters->conduction, &state->deferred.conduction, deferred->predictive.conduction);

@@ -35,9 +35,9 @@ LIMITED_BUILDS = ("cortex-m4", "cortex-m4-Os")
 FLASH_TOLERANCE_BYTES = 64
 RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
-BOUND_LIMITS = {"traditional": 730, "paper": 1350, "salient": 2080, "salient_network": 2560,
+BOUND_LIMITS = {"traditional": 730, "paper": 1260, "salient": 2080, "salient_network": 2560,
                 "salient_four_phases": 2500}
-"""Of the control interrupt on the Cortex-M4. The budget of paper is 1260: its scheduled bandwidth takes more."""
+"""Of the control interrupt on the Cortex-M4."""
 BOTH_BOUND_LIMITS = {"salient": 2950, "salient_four_phases": 3350}
 """Of both interrupts together."""
 

@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "control/bp_tuner.h"
 #include "control/pwm_ditc.h"
 #include "fixed/formats.h"
 }
@@ -64,24 +65,35 @@ pwm_ditc_parameters_t parameters_of(bp_pid_mode_t mode) {
 
 class PwmDitc : public testing::Test {
   protected:
-    PwmDitc() { pwm_ditc_reset(&parameters, &ditc); }
+    PwmDitc() { reset(); }
+
+    void reset() {
+        pwm_ditc_reset(&ditc);
+        bp_tuner_reset(&parameters.pid, &tuner);
+    }
 
     // One sample with the torques of the phase map for the currents.
     void step(const roles_t &commutation, double reference_Nm) {
         const int32_t reference_q24 = to_fixed(reference_Nm, Q24);
         plan.setpoint_q9 =
             std::min(pwm_ditc_setpoint_q9(&parameters.current_setpoints, reference_q24), parameters.current_limit_q9);
-        pwm_ditc_sample_t sample{.current_q9 = current_q9, .torque = torque, .error_q24 = reference_q24, .plan = &plan};
+        pwm_ditc_sample_t sample{.current_q9 = current_q9,
+                                 .torque = torque,
+                                 .error_q24 = reference_q24,
+                                 .gain_q24 = tuner.gain_q24,
+                                 .plan = &plan};
         for (unsigned phase = 0; phase < 3; phase++) {
             torque[phase] = phase_map_torque(&machine_tables, commutation.angle[phase], current_q9[phase]);
             sample.error_q24 -= phase_map_scale(&machine_tables.torque_format, torque[phase]);
         }
         error_q24 = sample.error_q24;
         pwm_ditc_step(&parameters, &ditc, &commutation, &sample, duty_q15);
+        bp_tuner_step(&parameters.pid, &tuner, &ditc.pid.sample);
     }
 
     pwm_ditc_parameters_t parameters = parameters_of(BP_PID_FIXED);
     pwm_ditc_t ditc{};
+    bp_tuner_t tuner{};
     pwm_ditc_plan_t plan{.factor_q16 = 1 << 16, .duty_per_torque_q47 = 0, .setpoint_q9 = 0, .lead = 0};
     int32_t current_q9[HAL_PHASES_MAX] = {0, 0, 0, 0};
     pwm_ditc_plan_t plan_of(uint32_t angle, int32_t phase_q9, int32_t reference_q24 = 8 << 24, int32_t step = 0) const {
@@ -103,7 +115,7 @@ TEST_F(PwmDitc, from_standstill_every_rotor_position_drives_phases_that_can_carr
     double weakest = 1e9;
     for (int tenth_deg = 0; tenth_deg < 3600; tenth_deg++) {
         const roles_t commutation = roles_at(ANGLES, 3, 4, electrical_angle(tenth_deg / 10.0));
-        pwm_ditc_reset(&parameters, &ditc);
+        reset();
         for (int k = 0; k < 20; k++) {
             step(commutation, 8.0);
         }
@@ -123,8 +135,7 @@ TEST_F(PwmDitc, a_single_phase_gets_the_duty_of_the_pid_and_the_others_are_off) 
     const roles_t commutation = commutation_of(230.0);
     ASSERT_EQ(commutation.active, 0u);
     ASSERT_EQ(commutation.outgoing, unsigned(COMMUTATION_NONE));
-    bp_pid_t pid;
-    bp_pid_reset(&parameters.pid, &pid);
+    bp_pid_t pid{};
     int32_t last_q24 = 0;
     for (int k = 0; k < 50; k++) {
         current_q9[0] = (k % 30) << 9;
@@ -133,7 +144,7 @@ TEST_F(PwmDitc, a_single_phase_gets_the_duty_of_the_pid_and_the_others_are_off) 
         // Both errors times the present factor: a factor that changes is no change of the error.
         const auto normalised = [&](int32_t raw_q24) { return int32_t(int64_t(raw_q24) * plan.factor_q16 >> 16); };
         bp_pid_set_error(&parameters.pid, &pid, normalised(last_q24));
-        EXPECT_EQ(duty_q15[0], bp_pid_step(&parameters.pid, &pid, normalised(error_q24)));
+        EXPECT_EQ(duty_q15[0], bp_pid_step(&parameters.pid, &pid, tuner.gain_q24, normalised(error_q24)));
         last_q24 = error_q24;
         EXPECT_EQ(duty_q15[1], -ONE_Q15);
         EXPECT_EQ(duty_q15[2], -ONE_Q15);
@@ -166,7 +177,7 @@ TEST_F(PwmDitc, the_incoming_phase_is_driven_by_half_of_a_deadbeat_law_to_the_cu
     const roles_t commutation = commutation_of(300.5);
     ASSERT_EQ(commutation.active, 1u);
     for (double reference = 0.5; reference < 14.0; reference += 0.25) {
-        pwm_ditc_reset(&parameters, &ditc);
+        reset();
         current_q9[0] = map_current_q9(commutation.angle[0], to_fixed(reference, Q24));
         const double carrying_A = pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference, Q24)) / Q9;
         const double target_A = std::min(carrying_A, LIMIT_Q9 / Q9);
@@ -189,7 +200,7 @@ TEST_F(PwmDitc, the_current_of_the_incoming_phase_does_not_overshoot_and_settles
     const double target_A = pwm_ditc_setpoint_q9(&parameters.current_setpoints, to_fixed(reference, Q24)) / Q9;
     const double rise_A = 0.5 / (parameters.incoming_gain_q24 / Q24);
     for (const double inductance : {1.0, 1.5, 3.0, 10.0}) {
-        pwm_ditc_reset(&parameters, &ditc);
+        reset();
         std::fill(std::begin(duty_q15), std::end(duty_q15), -ONE_Q15);
         current_q9[0] = map_current_q9(commutation.angle[0], to_fixed(reference, Q24));
         double current_A = 0.0, most_A = 0.0;
@@ -212,7 +223,7 @@ TEST_F(PwmDitc, the_pid_changes_phases_when_the_incoming_one_has_the_larger_torq
     for (double reference = 0.0; reference < 16.0; reference += 0.5) {
         for (int outgoing_A = 0; outgoing_A < 52; outgoing_A += 2) {
             for (int incoming_A = 0; incoming_A < 52; incoming_A += 2) {
-                pwm_ditc_reset(&parameters, &ditc);
+                reset();
                 current_q9[0] = outgoing_A << 9;
                 current_q9[1] = incoming_A << 9;
                 step(commutation, reference);
@@ -232,6 +243,7 @@ TEST_F(PwmDitc, a_change_of_phases_is_bumpless_and_the_outgoing_phase_keeps_its_
     current_q9[0] = 20 << 9;
     current_q9[1] = 10 << 9;
     std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0); // the PID keeps its duty
+    bp_tuner_reset(&parameters.pid, &tuner);
     step(commutation, 4.0);
     const double reference = torque_Nm(1); // of the incoming phase alone
     bp_pid_preset(&ditc.pid, -9000);
@@ -277,6 +289,7 @@ TEST_F(PwmDitc, an_outgoing_phase_that_was_left_gets_no_voltage_that_raises_it_u
 TEST_F(PwmDitc, what_the_incoming_phase_gains_in_torque_is_taken_from_the_duty_of_the_outgoing_one) {
     const roles_t commutation = commutation_of(310.0);
     std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0);
+    bp_tuner_reset(&parameters.pid, &tuner);
     plan.duty_per_torque_q47 = parameters.duty_per_torque_q44 << 3;
     current_q9[0] = 25 << 9;
     double last_Nm = 0.0, largest = 0.0;
@@ -387,6 +400,7 @@ TEST_F(PwmDitc,
     ASSERT_EQ(ditc.regulated, 0u);
     // The same sample before and past 348 degrees. Gains of 0, so that the increment of the PID is known.
     std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0);
+    bp_tuner_reset(&parameters.pid, &tuner);
     step(commutation_of(347.99), 3.0);
     const int32_t incoming_q15 = duty_q15[1];
     ASSERT_NE(incoming_q15, duty_q15[0]);
@@ -423,7 +437,7 @@ TEST_F(PwmDitc, a_phase_that_lacks_torque_stays_below_the_ceiling_and_close_to_i
         parameters.current_limit_q9 = to_fixed(ceiling_A, Q9);
         parameters.current_ceiling_q9 = to_fixed(ceiling_A, Q9);
         parameters.ceiling_gain_q24 = to_fixed(1.0 / (1.1 * rise_A), Q24);
-        pwm_ditc_reset(&parameters, &ditc);
+        reset();
         std::fill(std::begin(duty_q15), std::end(duty_q15), -ONE_Q15);
         // The duty of a sample acts from the next one on; a hundredth of the voltage is lost.
         double current_A = 0.0, most_A = 0.0;
@@ -448,7 +462,7 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
             parameters = parameters_of(mode);
             parameters.incoming_gain_q24 = gain;
             parameters.ceiling_gain_q24 = gain;
-            pwm_ditc_reset(&parameters, &ditc);
+            reset();
             for (int k = 0; k < 3000; k++) {
                 const roles_t commutation = roles_at(ANGLES, 3, 4, uint32_t(random()));
                 for (unsigned phase = 0; phase < 3; phase++) {
@@ -459,9 +473,13 @@ TEST_F(PwmDitc, nothing_overflows_at_the_ends_of_all_ranges) {
                         .duty_per_torque_q47 = gain,
                         .setpoint_q9 = int32_t(random() % LIMIT_Q9),
                         .lead = 0};
-                const pwm_ditc_sample_t sample = {
-                    .current_q9 = current_q9, .torque = torque, .error_q24 = ends[random() % 5], .plan = &plan};
+                const pwm_ditc_sample_t sample = {.current_q9 = current_q9,
+                                                  .torque = torque,
+                                                  .error_q24 = ends[random() % 5],
+                                                  .gain_q24 = tuner.gain_q24,
+                                                  .plan = &plan};
                 pwm_ditc_step(&parameters, &ditc, &commutation, &sample, duty_q15);
+                bp_tuner_step(&parameters.pid, &tuner, &ditc.pid.sample);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     ASSERT_LE(std::abs(duty_q15[phase]), ONE_Q15);
                 }

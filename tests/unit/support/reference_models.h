@@ -481,7 +481,8 @@ struct network_t {
     }
 };
 
-// Incremental PID with the gains of the network, bp_pid.h. `scaled_limit`: largest scaled error.
+// Incremental PID with the gains of the network, bp_pid.h and bp_tuner.h: those of a step are by the inputs of the step
+// before. `scaled_limit`: largest scaled error.
 struct bp_pid_t {
     enum mode_t { FIXED = 1, FROZEN = 2, LEARNING = 3 };
     mode_t mode;
@@ -492,23 +493,24 @@ struct bp_pid_t {
     network_t network{};
     double error = 0.0, previous = 0.0, duty = 0.0;
     std::array<double, 3> gain{};
-    bool learned = false;
+    bool passed = false, learned = false;
 
     double step(double torque_error) {
         const auto clamped = [this](double value) { return std::clamp(value, -scaled_limit, scaled_limit); };
         const double e = clamped(torque_error * error_scale_inverse);
         const network_t::outputs_t term = {clamped(e - error), e, clamped(e - 2.0 * error + previous)};
-        if (mode != FIXED) {
-            network.forward({e, term[0], term[2]});
-        }
         double next = duty;
         for (unsigned l = 0; l < 3; l++) {
-            gain[l] = scale[l] * (mode == FIXED ? 0.5 : network.output[l]);
+            gain[l] = scale[l] * (passed ? network.output[l] : 0.5);
             next += gain[l] * term[l];
         }
-        learned = mode == LEARNING && std::fabs(next) <= 1.0 && std::fabs(e) < scaled_limit;
+        learned = mode == LEARNING && passed && std::fabs(next) <= 1.0 && std::fabs(e) < scaled_limit;
         if (learned) {
             network.learn(eta, alpha, e, term);
+        }
+        if (mode != FIXED) {
+            network.forward({e, term[0], term[2]});
+            passed = true;
         }
         duty = std::clamp(next, -1.0, 1.0);
         previous = error;
