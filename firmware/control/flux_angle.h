@@ -30,7 +30,7 @@
 typedef struct {
     int64_t sum[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES];  /* of products, upper triangle */
     uint32_t samples;                                     /* modulo 2^32 */
-    uint32_t conduction_samples, last_conduction_samples; /* of this conduction, 0 between two, and the last one */
+    uint32_t conduction_samples, last_conduction_samples; /* samples; the former 0 between two */
     int32_t resistive_q29;                                /* integral of R i since the phase has conducted, Wb, Q2.29 */
     int32_t time_q29;                                     /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
 } flux_angle_t;

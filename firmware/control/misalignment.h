@@ -50,7 +50,7 @@
 #include "hal.h"
 
 #define MISALIGNMENT_PROBE_ANGLE 6835653 /* 0.01 rad, 2^-32 rev */
-/* What the flux linkage may err by with the shape of the tables: 0.29 degrees, 2^-32 rev. */
+/* Error of the angle by flux linkage that tables of another shape than the machine's make: 0.29 degrees, 2^-32 rev. */
 #define MISALIGNMENT_SHAPE_ANGLE (MISALIGNMENT_PROBE_ANGLE / 2)
 
 typedef struct {

@@ -60,7 +60,7 @@ typedef struct {
     int32_t duty_per_torque_q44; /* 1 / S, duty per unit of the tables, Q44 */
 } pwm_ditc_parameters_t;
 
-/* What follows from a sample and may act some periods later; all zero: the BP-PID keeps its duty. */
+/* Values that follow from a sample and may act some periods later; all zero: the BP-PID keeps its duty. */
 typedef struct {
     int32_t factor_q16;          /* S at the reference point / S of the regulated phase, Q16, 1/32..4 */
     int32_t duty_per_torque_q47; /* 1 / S, duty per unit of the tables, Q47 */

@@ -143,7 +143,7 @@ static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sa
     phase->most_q29 = sample->table_q29 > phase->most_q29 ? sample->table_q29 : phase->most_q29;
 }
 
-/* What the sensor reads without a current: the least of the last readings, of which noise makes none larger. */
+/* Reading of the sensor without a current: the least of the last readings, of which noise makes none larger. */
 static int32_t rest_q17(const table_scale_phase_t *phase, int32_t current_q9) {
     const int32_t now_q17 = current_q9 * (1 << REST_BITS);
     return now_q17 < phase->rest_q17 ? now_q17 : phase->rest_q17 + ((now_q17 - phase->rest_q17) >> REST_BITS);

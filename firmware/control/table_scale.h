@@ -84,7 +84,7 @@ typedef struct {
     bool lost;              /* control periods were lost since the last sample */
 } table_scale_sample_t;
 
-/* What the interrupt needs: with voltages and resistances over s the flux linkages of predictive_torque.h are those of
+/* Factors for the interrupt: with voltages and resistances over s the flux linkages of predictive_torque.h are those of
  * the tables. */
 typedef struct {
     int32_t excess_q31;              /* s - 1, Q0.31 */

@@ -45,7 +45,7 @@ typedef struct {
     int32_t step;      /* rotation since then, 2^-32 electrical rev */
     int32_t offset_q9; /* tolerance of a current, A, Q7.9 */
     int32_t delay_q29; /* tolerance of a flux linkage, Wb, Q2.29 */
-    /* Of a period, Wb, Q2.29: */
+    /* Errors in a period, Wb, Q2.29: */
     int32_t voltage_q29; /* error of the voltage, by its sensor or by pulses that do not act */
     int32_t device_q29;  /* threshold of the devices */
     int32_t error_q29;   /* the larger one */
@@ -184,7 +184,7 @@ static bool at_rest(const common_t *common, phase_monitor_t *monitor, unsigned p
     const uint32_t periods = state->rest_q29 == 0 ? 1 : common->elapsed & 0xffffu;
     monitor->suspicious |= input->current_q9[phase] > 2 * common->offset_q9;
     state->rest_q29 = fixed_saturate(state->rest_q29 + (int64_t)input->period_flux_q29 * (int32_t)periods);
-    /* Of a cold winding the integral is 0 before the flux linkage is. */
+    /* The integral of a cold winding is 0 before the flux linkage is. */
     const int32_t remains_q29 = applied_flux_cold_q29(state->followed_drop_q29);
     if (state->rest_q29 < fixed_add(fixed_add(state->peak_q29 / 4, common->delay_q29), remains_q29)) {
         return false;

@@ -378,7 +378,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
     }
 }
 
-// Where the ripple teaches nothing: the phases in turn, each by its own angle, with its slope at hand.
+// The ripple teaches nothing: the phases in turn, each by its own angle, with its slope at hand.
 TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_half_of_the_rate) {
     const misalignment_parameters_t parameters = parameters_of(8);
     misalignment_t state;

@@ -41,7 +41,7 @@ CURRENT_RANGE_A = 80.0
 """Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
 _CURRENT_SEARCHED_A = 10_000.0
 _MORE_CURRENT = 0.01
-"""Of the square of the current, relatively, for which a window is wider."""
+"""Increase of the square of the current, relatively, for which a window is wider."""
 _RPM = 30.0 / math.pi
 
 

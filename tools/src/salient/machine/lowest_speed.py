@@ -32,7 +32,7 @@ COARSE_BITS = 12
 GROWTH_MAX = 4.5
 TORQUE_ERROR = 0.02
 HASTE = {"salient": 1.0, "paper": 2.0, "traditional": 3.0}
-"""How much closer the counts are to be, by controller."""
+"""Factor by which the counts are to be closer, by controller."""
 
 RATED_PART = 0.75
 """Part of the rated torque for which both are taken."""
@@ -42,8 +42,8 @@ _CURRENTS = 160
 
 
 def lowest_speed_rpm(machine: str, encoder_bits: int, controller: str) -> float:
-    """Of a machine by its name or file, rounded up to 0.01 r/min, as messages name it; 0 with an encoder that is not
-    coarse, or ideal (0 bits)."""
+    """Lowest speed of a machine by its name or file, rounded up to 0.01 r/min, as messages name it; 0 with an encoder
+    that is not coarse, or ideal (0 bits)."""
     if not 0 < encoder_bits <= COARSE_BITS:
         return 0.0
     return math.ceil(100.0 * HASTE[controller] * _lowest_rpm(machine, encoder_bits)) / 100.0

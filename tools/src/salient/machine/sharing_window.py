@@ -22,7 +22,7 @@ from salient.machine.least_current import OVERLAP_MIN_DEG, WINDOW_SHARE, least_c
 from salient.machine.torque_speed import smooth_torque_Nm
 
 PARTS = (0.25, 0.5, 0.75, 1.0)
-"""Of the torque SharingWindow.torque_Nm, as MACHINE_SHARING_PARTS."""
+"""Parts of the torque SharingWindow.torque_Nm, as MACHINE_SHARING_PARTS."""
 SPEEDS = 2
 """Standstill and base speed, as MACHINE_SHARING_SPEEDS."""
 
@@ -35,23 +35,24 @@ _TURN = 2 * _HALF
 _CURRENTS = 160
 _FLUX_POINTS = 64
 MORE_AT_REST, _MORE_AT_SPEED = 0.03, 0.01
-"""Of the square of the current, relatively, for which a window is wider: the torque of phases that share a revolution
-more evenly depends less on errors of angle and tables. At speed the voltage takes as much again."""
+"""Increase of the square of the current, relatively, for which a window is wider: the torque of phases that share a
+revolution more evenly depends less on errors of angle and tables. At speed the voltage takes as much again."""
 _EARLIER_DEG = np.arange(0.0, 49.0, 3.0)
 """By which an angle is earlier at the base speed than at standstill."""
 _WIDTH_WEIGHT = 3e-4
-"""That a degree is worth by which a window is wider: shares that change less in a control period."""
+"""Worth of a degree by which a window is wider: shares that change less in a control period."""
 _VOLTAGE_PART = 0.93
-"""Of the voltage: the rest is for the errors of a drive, whose torque ripples where nothing is left."""
+"""Part of the voltage that a window may take: the rest is for the errors of a drive, whose torque ripples where nothing
+is left."""
 _LEAD_MAX_DEG = 20.0
-"""As SHARE_LEAD_MAX in firmware/control/conduction.c."""
+"""SHARE_LEAD_MAX of firmware/control/conduction.c."""
 _RIPPLE_FREE = 0.005
 _RIPPLE_WEIGHT = 20.0
 """Relative square of the current that a ripple beyond _RIPPLE_FREE is worth."""
 _FAR_DEG = 200.0
 """Between the angles of neighbouring parts that costs as much as the current: what lies between is interpolated."""
 _EARLIER_WEIGHT = 1e-4
-"""That a degree is worth: where nothing else is better."""
+"""Worth of an earlier degree: where nothing else is better."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
-"""What no drive goes below: the least mean sum of squares of the phase currents with which a machine makes a torque
-without ripple at a speed.
+"""Bound that no drive goes below: the least mean sum of squares of the phase currents with which a machine makes a
+torque without ripple at a speed.
 
 All phases do the same, one stroke apart. Their flux linkages over an electrical revolution are the variables; at every
 angle the torques add up to the wanted one, and from angle to angle a flux linkage changes by at most what the voltage
@@ -23,7 +23,7 @@ STEP_DEG = 3
 _TURN = 360 // STEP_DEG
 _HALF = _TURN // 2
 _POINTS = 200
-"""Of the flux linkage, and of the share of the torque."""
+"""Points of the flux linkage, and of the share of the torque."""
 _ITERATIONS = 200
 _MET = 1e-4
 """Relative error of the torque and of the voltage."""

@@ -49,7 +49,7 @@ MOVING_MACHINES = ("saturating", "finite_element")
 SINE_NM = 4.0
 SINES_HZ = (1.0, 5.0, 20.0, 50.0, 100.0)
 FAST_SINES_HZ = (150.0, 200.0, 300.0, 500.0)
-"""Of `salient` only."""
+"""Frequencies that only `salient` is measured at."""
 SINE_WINDOW_S = 0.15
 """Two periods of the load where they are longer."""
 RAMPS_MS = (1, 5, 20, 50, 100, 200, 500)

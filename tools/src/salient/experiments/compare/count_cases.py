@@ -25,11 +25,11 @@ EXTRACTOR = "counts"
 BITS, BITS_ALL = (10, 14, 17), tuple(range(10, 19))
 RATES_HZ = (20_000, 40_000, 50_000, 100_000)
 SPEEDS, SPEEDS_QUICK, SPEEDS_ALL = 16, 4, 28
-"""Of a machine and resolution; the last times 9 resolutions and 8 machines is 2,016."""
+"""Numbers of speeds of a machine and resolution; the last times 9 resolutions and 8 machines is 2,016."""
 SAMPLED = (MACHINES[0], MACHINES[-1])
 OUTSIDE = tuple(str(EXAMPLES / f"{name}.toml") for name in ("fan12", "map86", "servo86", "traction"))
 LOWEST_PART, LOAD_PART = 0.02, 0.5
-"""Of base speed and rated torque."""
+"""Parts of base speed and rated torque."""
 RIPPLE_AFTER_S, WINDOW_S, WINDOWS = 0.02, 0.1, 4
 """The ripple is the largest of successive windows, from this time after the load step on."""
 DENOMINATORS = (1, 1, 1, 2, 2, 3, 4, 5)
@@ -57,13 +57,13 @@ GROUPS: dict[str, Callable[[bool, Sequence[str]], Iterator[Case]]] = {"speeds": 
 
 
 def condition(machine: str, bits: int) -> str:
-    """Of a machine's name or file."""
+    """Label of a machine by its name or file."""
     return f"{Path(machine).stem}, {bits} bits, load step"
 
 
 @lru_cache
 def _data(machine: str) -> tuple[DriveData, Scale]:
-    """Of a machine's name or file; it takes a while."""
+    """Drive data and scale of a machine by its name or file; computing them takes a while."""
     loaded = load_machine(machine_path(machine))
     return derive(loaded), scale_of(loaded)
 
@@ -103,6 +103,6 @@ def _scenario(machine: str, bits: int, rate_hz: int, speed_rpm: float, load_Nm: 
 
 
 def windows_s(scenario: Scenario) -> list[tuple[float, float]]:
-    """Of the ripple."""
+    """Windows of the ripple, s."""
     first_s = scenario.load[0].at_s + RIPPLE_AFTER_S
     return [(first_s + number * WINDOW_S, first_s + (number + 1) * WINDOW_S) for number in range(WINDOWS)]

@@ -23,8 +23,8 @@ _PEAK_POWER_PER_VOLT_A = 120.0
 
 @dataclass(frozen=True)
 class Spread:
-    """What machines are drawn from. resistance: smallest and largest part of the supply that the current for the torque
-    takes, and the exponent of the torque below 1 N m by which it grows. imperfect: with device drops and current
+    """Ranges that machines are drawn from. resistance: smallest and largest part of the supply that the current for the
+    torque takes, and the exponent of the torque below 1 N m by which it grows. imperfect: with device drops and current
     sensors of a real drive."""
 
     seed: int

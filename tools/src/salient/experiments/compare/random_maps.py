@@ -21,7 +21,7 @@ FOLDER = BUILD / "random_maps"
 _POLES = ((6, 4, 3), (8, 6, 4), (12, 8, 3))
 _SUPPLIES_V = (24.0, 48.0, 110.0, 240.0, 400.0, 700.0)
 _ARC = {3: (0.345, 0.45), 4: (0.3, 0.45)}
-"""Of the stator poles, in pitches, by phases."""
+"""Arcs of the stator poles, in pitches, by phases."""
 _ANGLES, _CURRENTS = 97, 17
 _CURRENT_OVER = 2.0
 """Largest current of the map over that of the machine."""

@@ -58,7 +58,8 @@ MOTORING_SHORT_PERCENT, BRAKING_SHORT_PERCENT = 3.0, 8.0
 PEAK_TO_LIMIT_MAX = 1.03
 UP_TO_BASE, UP_TO_BASE_QUICK = (0.1, 0.5, 1.0), (0.1,)
 COPPER_RATIO_MAX, COPPER_RIPPLE_MAX = 1.06, 0.045
-"""Of the ripple: of single samples of a machine of 8/6 poles at its base speed, in 27 control periods of a stroke."""
+"""Largest copper ratio and ripple; the latter is that of single samples of a machine of 8/6 poles at its base speed, in
+27 control periods of a stroke."""
 RMS_RATIO_MAX, TORQUE_ERROR_MAX_PERCENT = 1.1, 3.0
 
 SLOW, FAST = 0.5, 1.5
