@@ -24,6 +24,20 @@
 /* Corner of high-pass and low-pass of the sum and of y in rad per stroke, and the largest gain of both. */
 #define BAND_FACTOR 4
 #define BAND_GAIN_MAX_Q16 (1 << 15)
+/* (0.02 rad / s)^2 9 / 48 / 16, which is 75. */
+#define NOISE_FACTOR 75
+#define TWO_PI_Q10 6434
+
+/* N / 16 = 75 rate Ts (J w0^2 q)^2, in (N m per 0.02 rad)^2. */
+static int32_t noise_q22(const misalignment_settings_t *settings) {
+    const uint64_t square = (uint64_t)settings->bandwidth_rad_s * settings->bandwidth_rad_s; /* 27 bits */
+    const uint64_t per_turn_q24 = ((uint64_t)settings->inertia_q30 * square >> 16) * TWO_PI_Q10;
+    const int64_t count_q24 = (int64_t)(per_turn_q24 >> (settings->encoder_bits + settings->speed_exponent));
+    const int64_t limited_q24 = fixed_clamp_64(count_q24, 0, INT32_MAX);
+    const int64_t squared_q22 = (limited_q24 * limited_q24) >> 26;
+    return fixed_saturate(fixed_divide(squared_q22 * NOISE_FACTOR * settings->rate_1_s, settings->control_rate_hz));
+}
+
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings) {
     const uint32_t update_rate_hz = settings->control_rate_hz / settings->periods_per_update;
     const uint32_t phase_rate_hz = update_rate_hz / settings->phases;
@@ -36,6 +50,7 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
         .flux_rate_q8 = (int32_t)fixed_divide((int64_t)settings->rate_1_s << 46, (int64_t)probe_angle * phase_rate_hz),
         .filter_q32 = (int32_t)fixed_divide(((int64_t)8 << 32) / 5, phase_rate_hz),
         .mean_q16 = (int32_t)fixed_divide((int64_t)MEAN_1_S << 16, phase_rate_hz) + 1,
+        .noise_q22 = noise_q22(settings),
         .inertia_rate_q8 = fixed_saturate(((int64_t)settings->inertia_q30 * settings->control_rate_hz) >> 22),
         .settle_updates = update_rate_hz * SETTLE_MS / 1000u,
     };
@@ -211,7 +226,11 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     }
     const int32_t gain_q16 = fixed_clamp(stroke_part_q16, 0, BAND_GAIN_MAX_Q16 / BAND_FACTOR) * BAND_FACTOR;
     const int32_t quarter_q24 = band_pass_step(&misalignment->common_slope, sum_q24, gain_q16);
-    const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, disturbance_q24, gain_q16);
+    /* Mean of the four samples since the last step: single ones would show quantisation that is far above the band as a
+     * slow one. */
+    const int32_t mean_q24 = (int32_t)((misalignment->disturbance_sum_q24 - misalignment->last_common_sum_q24) >> 2);
+    misalignment->last_common_sum_q24 = misalignment->disturbance_sum_q24;
+    const int32_t error_q24 = band_pass_step(&misalignment->common_disturbance, mean_q24, gain_q16);
     const int64_t square_q40 = fixed_product(quarter_q24, quarter_q24) >> 8;
     misalignment->common_power_q40 += (square_q40 - misalignment->common_power_q40) >> COMMON_POWER_SHIFT;
     if (!misalignment->learning) {
@@ -220,7 +239,7 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t power_q22 = fixed_saturate(misalignment->common_power_q40 >> 18);
     /* T^2 2^-26 of the square of a quarter: 0.00007 T^2 / rad^2. */
     const int32_t torque_q9 = torque_q24 >> 15; /* at most 64 N m: its square is 2^30 */
-    const int32_t floor_q22 = (torque_q9 * torque_q9 >> 25) + 1;
+    const int32_t floor_q22 = fixed_add((torque_q9 * torque_q9 >> 25) + 1, parameters->noise_q22);
     /* y 4 q / (16 q^2), q the quarter. */
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));

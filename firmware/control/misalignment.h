@@ -16,7 +16,15 @@
  * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than those of the
  * phases, which alternate more slowly. So the same law learns that angle once more, normalised by itself:
  *
- *   d delta / dt = rate / 2 y S / (mean of S^2 + 0.00007 T^2 / rad^2),   S = sum s_j
+ *   d delta / dt = rate / 2 y S / (mean of S^2 + 0.00007 T^2 / rad^2 + N),   S = sum s_j
+ *
+ * N is for the rounding to counts of q rad. Far above its bandwidth w0 the observer makes a y of 3 J w0^2 of the error
+ * of an angle, a rounding of the density q^2 / 6 Ts therefore a y of (3 J w0^2 q)^2 / 6 Ts. Of a white y of the density
+ * D the law makes a delta of the variance rate / 2 D / 4 / (S^2 + N) S^2 / (S^2 + N), which is at most s^2 with
+ *
+ *   N = rate / 8 D / s^2 = rate Ts (3 J w0^2 q)^2 / (48 s^2),   s = 0.00025 rad
+ *
+ * (derived here). A beat of the counts is not white: while there is one, nothing is learned from y (drive/deferred.c).
  *
  * Both alternate with the strokes, so y and S pass through the same band-pass around their frequency: the slopes jump
  * where phases are turned on and off, and sampling them folds the harmonics of these jumps to frequencies far below,
@@ -60,6 +68,7 @@ typedef struct {
     int32_t flux_rate_q8;    /* half of that rate, 2^-40 of 0.02 rad per 2^-32 electrical rev, Q23.8 */
     int32_t filter_q32;      /* 1.6 times the update interval, s, Q0.32 */
     int32_t mean_q16;        /* 10 / s times the update interval, Q0.16 */
+    int32_t noise_q22;       /* of the common angle, N / 16, (N m per 0.02 rad)^2, Q9.22 */
     int32_t inertia_rate_q8; /* J / Ts: N m per rad/s, Q23.8 */
     uint32_t settle_updates; /* steady updates before learning */
 } misalignment_parameters_t;
@@ -83,6 +92,7 @@ typedef struct {
 typedef struct {
     misalignment_phase_t phase[HAL_PHASES_MAX];
     int64_t disturbance_sum_q24;  /* sum of y over all updates, N m, Q24; 2^37 updates fit */
+    int64_t last_common_sum_q24;  /* at the last update of the common angle */
     int32_t disturbance_mean_q24; /* mean of y, N m, Q7.24 */
     int32_t power_q24;            /* mean of sum s_j^2, Q7.24 */
     uint32_t steady_updates;
@@ -117,6 +127,9 @@ typedef struct {
     unsigned periods_per_common_update; /* misalignment_common_step */
     int32_t inertia_q30;                /* kg m^2, Q1.30 */
     unsigned phases, rotor_poles;
+    unsigned encoder_bits;    /* 8..32 */
+    uint32_t bandwidth_rad_s; /* of the load observer in steady state, at most 10000 */
+    unsigned speed_exponent;  /* of machine_tables_t */
 } misalignment_settings_t;
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);

@@ -476,15 +476,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
         .conduction = conduction_from(values, tables, control_rate_hz, torque_min_q24),
-        .misalignment = misalignment_configure(&(misalignment_settings_t){
-            .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
-            .control_rate_hz = control_rate_hz,
-            .periods_per_update = DEFERRED_LEARNING_PERIODS,
-            .periods_per_common_update = DEFERRED_COMMON_PERIODS,
-            .inertia_q30 = inertia_q30,
-            .phases = tables->phases,
-            .rotor_poles = tables->rotor_poles,
-        }),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
     };
     control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
@@ -492,6 +483,18 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     set_reference_point(&control, values, tables, control_rate_hz);
     control.degraded = degraded_from(&control, values);
     set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
+    control.misalignment = misalignment_configure(&(misalignment_settings_t){
+        .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
+        .control_rate_hz = control_rate_hz,
+        .periods_per_update = DEFERRED_LEARNING_PERIODS,
+        .periods_per_common_update = DEFERRED_COMMON_PERIODS,
+        .inertia_q30 = inertia_q30,
+        .phases = tables->phases,
+        .rotor_poles = tables->rotor_poles,
+        .encoder_bits = encoder_bits,
+        .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[OBSERVER_BANDWIDTH_STEADY_STAGE],
+        .speed_exponent = tables->speed_exponent,
+    });
     control.moving_load = moving_load_configure(&(moving_load_settings_t){
         .encoder_bits = encoder_bits,
         .control_rate_hz = control_rate_hz,

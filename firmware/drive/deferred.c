@@ -199,13 +199,18 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
     return parameters->bandwidth.adaptive && input->bandwidth.stage < parameters->bandwidth.moving_stage;
 }
 
-/* Speed control in which neither a disturbance nor the voltage adds to the ripple. A misalignment of a quarter of a
- * stroke moves the speed by more than an eighth, and learning it ends that. */
+/* Beat of the counts (observer_bandwidth.h), whose sawtooth may be as slow as the strokes. */
+static bool beats(const deferred_input_t *input) {
+    return input->bandwidth.stage == OBSERVER_BANDWIDTH_STAGES - 1;
+}
+
+/* Speed control in which neither a disturbance, nor a beat, nor the voltage adds to the ripple. A misalignment of a
+ * quarter of a stroke moves the speed by more than an eighth, and learning it ends that. */
 static bool undisturbed_speed_control(const control_parameters_t *parameters, const deferred_t *deferred,
                                       const deferred_input_t *input) {
     const uint32_t speed_error_q22 = fixed_magnitude(fixed_subtract(deferred->speed_reference_q22, input->speed_q22));
     return deferred->mode == DRIVE_MODE_SPEED && speed_error_q22 < fixed_magnitude(input->speed_q22) / 8 &&
-           !disturbed(parameters, input) && input->torque_shortfall_q24 == 0;
+           !disturbed(parameters, input) && !beats(input) && input->torque_shortfall_q24 == 0;
 }
 
 /* The misalignment is observable while speed, load and voltage are steady. In torque mode nothing keeps the speed

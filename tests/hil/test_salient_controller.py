@@ -254,7 +254,7 @@ def test_misalignment_is_kept_over_stop_and_run(make_bench):
     bench.drive.stop()
     bench.run_until(lambda: bench.drive.state == "ready", timeout=0.2)
     learned_deg = misalignment_deg(bench)
-    assert 0.25 < learned_deg < 0.37  # moves on while the shaft is braked, with windows of their own
+    assert 0.22 < learned_deg < 0.37  # moves on while the shaft is braked, with windows of their own
     bench.run_for(0.2)
     assert misalignment_deg(bench) == learned_deg
     bench.drive.speed_reference_rpm = 150

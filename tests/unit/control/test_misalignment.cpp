@@ -3,6 +3,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <random>
 
 #include <gtest/gtest.h>
 
@@ -25,9 +26,11 @@ constexpr unsigned PHASES = 3;
 constexpr double PROBE_RAD = 0.01;
 using offsets_t = std::array<double, PHASES>; // degrees
 
-misalignment_parameters_t parameters_of(int32_t rate_1_s) {
+misalignment_parameters_t parameters_of(int32_t rate_1_s,
+                                        drive_controller_t controller = DRIVE_CONTROLLER_TRADITIONAL) {
     parameters_t p;
     parameters_init(&p);
+    p.values[PARAMETER_CONTROLLER] = controller;
     p.values[PARAMETER_ANGLE_TRIM] = rate_1_s != 0;
     if (rate_1_s != 0) {
         p.values[PARAMETER_ANGLE_TRIM_RATE_1_S] = rate_1_s;
@@ -225,6 +228,7 @@ TEST(Misalignment, at_600_rpm_the_common_angle_is_learned_in_1_s_and_the_phases_
         Machine with(8, {off, off, off}), without(8, {off, off, off});
         with.common = true;
         with.rpm = without.rpm = 600.0;
+        with.parameters.noise_q22 = 0;
         for (int k = 0; k < int(RATE_HZ); k++) {
             with.step(8.0, 8.0, true);
             without.step(8.0, 8.0, true);
@@ -239,6 +243,7 @@ TEST(Misalignment, at_600_rpm_the_common_angle_is_learned_in_1_s_and_the_phases_
 TEST(Misalignment, at_1500_rpm_where_sampling_folds_the_steps_of_the_slopes_the_common_angle_is_learned_in_3_s) {
     Machine machine(8, {1.0, 1.0, 1.0});
     machine.common = true;
+    machine.parameters.noise_q22 = 0;
     machine.rpm = 1500.0;
     for (int k = 0; k < int(3 * RATE_HZ); k++) {
         machine.step(8.0, 8.0, true);
@@ -246,6 +251,34 @@ TEST(Misalignment, at_1500_rpm_where_sampling_folds_the_steps_of_the_slopes_the_
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_NEAR(machine.offset_deg(phase), 1.0, 0.05) << phase;
     }
+}
+
+// Rounding makes a y of 3 J w0^2 of the error of each angle.
+TEST(Misalignment, of_the_rounding_to_counts_the_common_angle_makes_at_most_0_03_degrees) {
+    const double count_rad = 2.0 * PI / std::ldexp(1.0, 17);
+    const double stiffness_Nm = 0.02 * 250.0 * 250.0; // J w0^2 of the saturating machine
+    const auto worst_deg = [&](bool noise) {
+        Machine machine(8, {0.0, 0.0, 0.0});
+        machine.parameters.noise_q22 = noise ? parameters_of(8, DRIVE_CONTROLLER_SALIENT).noise_q22 : 0;
+        machine.common = true;
+        machine.rpm = 1300.0;
+        std::mt19937 random(5);
+        std::uniform_real_distribution<double> rounding(-0.5 * count_rad, 0.5 * count_rad);
+        double worst = 0.0;
+        for (int k = 0; k < int(8 * RATE_HZ); k++) {
+            machine.step(8.0, 8.0 + 3.0 * stiffness_Nm * rounding(random), true);
+            const double common_rad = 0.02 * std::ldexp(double(machine.state.common_sum_q40), -40);
+            worst = std::max(worst, std::fabs(degrees(common_rad)));
+        }
+        return worst;
+    };
+    const double count_Nm = stiffness_Nm * count_rad;
+    EXPECT_NEAR(parameters_of(8, DRIVE_CONTROLLER_SALIENT).noise_q22 / std::ldexp(1.0, 22),
+                75.0 * 8.0 / 40000.0 * count_Nm * count_Nm, 1e-6);
+    const double limited = worst_deg(true);
+    EXPECT_GT(limited, 0.001);
+    EXPECT_LT(limited, 0.03); // twice s
+    EXPECT_GT(worst_deg(false), 2.0 * limited);
 }
 
 TEST(Misalignment, under_a_load_that_moves_each_phase_takes_that_of_the_flux_linkage_within_1_s) {
