@@ -172,7 +172,7 @@ def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, c
     assert 0.5 * period_us < worst_us < 10 * period_us
     assert processor(bench, "used_us") < period_us  # in fault the deadlines are met again
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "interrupt_overrun"
-    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "run"
+    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name in ("ready", "run")
     assert currents_A(bench) == [0, 0, 0]
     assert run()[1] == first
 
