@@ -216,7 +216,7 @@ static int32_t band_pass_step(misalignment_band_t *band, int32_t value_q24, int3
 }
 
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16) {
+                              unsigned phases, int32_t torque_q24, int32_t stroke_part_q16) {
     /* A quarter of the sum over the phases, which fits. */
     int32_t sum_q24 = 0;
     const unsigned count = phases < HAL_PHASES_MAX ? phases : HAL_PHASES_MAX;

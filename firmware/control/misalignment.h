@@ -156,11 +156,12 @@ void misalignment_reset(misalignment_t *misalignment);
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
 
-/* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each,
- * while those learn from the ripple; each takes it with its next step. Disturbance and
- * torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as there. */
+/* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each
+ * and the mean of y since the last step, of four of them, while those learn from the ripple; each takes it with its
+ * next step. Torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as
+ * there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
-                              unsigned phases, int32_t disturbance_q24, int32_t torque_q24, int32_t stroke_part_q16);
+                              unsigned phases, int32_t torque_q24, int32_t stroke_part_q16);
 
 /* At the end of a stroke: forgets what was learned in it and in the one before, if it was of a load that has changed.
  * changed, grown: of stroke_mean_t. */

@@ -554,6 +554,7 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
     parameters->predictive.flux = tuned->predictive.flux;
     parameters->conduction.gain_per_step_q16 = tuned->conduction.gain_per_step_q16;
     parameters->moving_load = tuned->moving_load;
+    parameters->misalignment.noise_q22 = tuned->misalignment.noise_q22;
     parameters->periodic_load = tuned->periodic_load;
     parameters->inertia = tuned->inertia;
     bandwidth->retrigger_holdoff_ticks = tuned->bandwidth.retrigger_holdoff_ticks;

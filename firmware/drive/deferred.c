@@ -285,8 +285,7 @@ static int32_t stroke_part_q16(const control_parameters_t *parameters, const def
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
     misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
-                             disturbance_q24(deferred, input), input->torque_reference_q24,
-                             stroke_part_q16(parameters, input));
+                             input->torque_reference_q24, stroke_part_q16(parameters, input));
 }
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,

@@ -100,7 +100,7 @@ class Machine {
                    [&](unsigned phase) { return slope[phase]; });
         const unsigned each = DEFERRED_COMMON_PERIODS / DEFERRED_LEARNING_PERIODS;
         if (common && ++updates % each == 0) {
-            misalignment_common_step(&parameters, &state, PHASES, sample.disturbance_q24, sample.torque_q24,
+            misalignment_common_step(&parameters, &state, PHASES, sample.torque_q24,
                                      to_fixed(electrical_rev * PHASES * each, 65536.0));
         }
     }
@@ -401,7 +401,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
                 .condition = MISALIGNMENT_STEADY,
             };
             misalignment_step(&p, &state, &machine_tables, &sample);
-            misalignment_common_step(&p, &state, PHASES, sample.disturbance_q24, sample.torque_q24, int32_t(k) << 14);
+            misalignment_common_step(&p, &state, PHASES, sample.torque_q24, int32_t(k) << 14);
         }
         for (unsigned phase = 0; phase < PHASES; phase++) {
             const double deg = state.phase[phase].offset / REV / machine_tables.rotor_poles * 360.0;
