@@ -1,5 +1,5 @@
-/* Memory of the program and registers of the peripherals, for the checks of the background (drive/self_test.h). A port
- * that has none of a kind leaves it out: its check then passes. */
+/* Memory of the program and registers of the peripherals, for the checks of the background (interrupts/self_test.h). A
+ * port that has none of a kind leaves it out: its check then passes. */
 #ifndef HAL_MEMORY_H
 #define HAL_MEMORY_H
 

@@ -19,7 +19,7 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = ("CMakeLists.txt", "LICENSE", "firmware/comms/drive.dbc", "firmware/drive/parameters.def",
+FILES = ("CMakeLists.txt", "LICENSE", "firmware/comms/drive.dbc", "firmware/storage/parameters.def",
          "emulator/rig/rig.dbc")
 FOLDERS = ("tools/machines", "tools/loads", "tools/scenarios", "tools/examples")
 PROGRAMS = ("salient_host", "salient_reference")

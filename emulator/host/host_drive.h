@@ -4,7 +4,7 @@
 
 #include <stdbool.h>
 
-#include "drive.h"
+#include "drive/drive.h"
 #include "host/hal_host.h"
 #include "host/options.h"
 #include "rig/rig.h"

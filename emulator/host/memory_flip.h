@@ -5,7 +5,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "drive.h"
+#include "drive/drive.h"
 #include "rig/memory_object.h"
 
 /* Bit of the objects in drive_t, counted from the lowest of the first byte on: the same one on every target, which are

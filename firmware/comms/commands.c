@@ -5,10 +5,10 @@
 #include "comms/counter.h"
 #include "comms/units.h"
 #include "control/machine_tables.h"
-#include "drive/parameters.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
+#include "storage/parameters.h"
 
 /* The only bits of a frame to the drive that no signal covers: required to be zero, reserved for later use. */
 #define PARAMETER_REQUEST_RESERVED_BYTE 3

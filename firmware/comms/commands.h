@@ -30,8 +30,8 @@
 
 #include "comms/arming.h"
 #include "comms/e2e.h"
-#include "drive/command.h"
 #include "hal_can.h"
+#include "interrupts/command.h"
 
 #define COMMANDS_ERROR_STEP 256u
 #define COMMANDS_ERRORS_MAX 4u

@@ -24,12 +24,12 @@
 #include "comms/frame_queue.h"
 #include "comms/parameter_set.h"
 #include "comms/telemetry.h"
-#include "drive/control.h"
-#include "drive/fault_trace.h"
-#include "drive/nvm_store.h"
-#include "drive/parameters.h"
-#include "drive/self_test.h"
 #include "hal_can.h"
+#include "interrupts/control_step.h"
+#include "interrupts/fault_trace.h"
+#include "interrupts/self_test.h"
+#include "storage/nvm_store.h"
+#include "storage/parameters.h"
 
 /* Maximum number of received frames that one call processes. The shortest frame takes 47 us at 1 Mbit/s, so even a
  * fully loaded bus delivers fewer than this between two calls at the lowest control rate. */

@@ -4,9 +4,9 @@
 
 #include <stdbool.h>
 
-#include "drive/nvm_store.h"
-#include "drive/self_test.h"
 #include "hal_can.h"
+#include "interrupts/self_test.h"
+#include "storage/nvm_store.h"
 
 /* Writes the response to a request; false when it is one of another operation. The response repeats operation, index
  * and part. Nothing is changed: save and restore_defaults are for PARAMETER_SET_CONTROL. frame must have passed

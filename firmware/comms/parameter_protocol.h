@@ -2,8 +2,8 @@
 #ifndef COMMS_PARAMETER_PROTOCOL_H
 #define COMMS_PARAMETER_PROTOCOL_H
 
-#include "drive/parameters.h"
 #include "hal_can.h"
+#include "storage/parameters.h"
 
 /* Writes the response to a request, which it repeats with operation, index and part; nothing is changed by any request.
  * Text is transferred four ASCII characters at a time, the first in the lowest byte; a part beyond the end of the text

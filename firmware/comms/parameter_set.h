@@ -15,9 +15,9 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "drive/nvm_store.h"
-#include "drive/parameters.h"
 #include "hal_can.h"
+#include "storage/nvm_store.h"
+#include "storage/parameters.h"
 
 /* All zero: nothing is staged. */
 typedef struct {

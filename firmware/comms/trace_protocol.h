@@ -1,12 +1,13 @@
-/* The operation fault_trace of PARAMETER_REQUEST: reads the control periods before a fault (drive/fault_trace.h). */
+/* The operation fault_trace of PARAMETER_REQUEST: reads the control periods before a fault (interrupts/fault_trace.h).
+ */
 #ifndef COMMS_TRACE_PROTOCOL_H
 #define COMMS_TRACE_PROTOCOL_H
 
 #include <stdbool.h>
 
-#include "drive/control.h"
-#include "drive/fault_trace.h"
 #include "hal_can.h"
+#include "interrupts/control_step.h"
+#include "interrupts/fault_trace.h"
 
 /* Executes a request and writes its response; false, with nothing done, when it is one of another operation. The
  * response repeats operation, index and part. frame must have passed commands_receive. [background] */

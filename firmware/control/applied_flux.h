@@ -6,7 +6,7 @@
  *
  * Both switches off are the duty -1: full opposite voltage until the flux linkage has gone. A phase that is off once in
  * an electrical revolution begins at 0 each time. Drops of the devices and errors of R and Vdc accumulate; the caller
- * corrects the integral by what it knows of the flux linkage (drive/phase_monitor.h). While there is current it may
+ * corrects the integral by what it knows of the flux linkage (monitors/phase_monitor.h). While there is current it may
  * fall below 0: that is what the error of R is known by (table_scale.h). */
 #ifndef CONTROL_APPLIED_FLUX_H
 #define CONTROL_APPLIED_FLUX_H

@@ -11,7 +11,7 @@
 
 /* Of the sums: 2^11 samples, 0.45 s of a phase that conducts for nearly half of the time and has ten a millisecond.
  * They are solved after each 256, from 1.1 s on: an encoder that is displaced by more than can be learned has been
- * found before (drive/phase_balance.h). */
+ * found before (monitors/phase_balance.h). */
 #define FORGET_BITS 11
 #define SAMPLES_MIN 5120u
 #define SAMPLES_EACH 256u

@@ -129,7 +129,7 @@ typedef struct {
      * needs that, theta_t is where psi at the limit falls fastest. */
     uint16_t braking_end[MACHINE_PULSE_POINTS];  /* theta_t past the aligned position, 2^-16 electrical rev */
     uint16_t braking_flux[MACHINE_PULSE_POINTS]; /* psi_t, Wb, Q2.13 (Q2.29 >> 16) */
-    /* Of drive/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
+    /* Of storage/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
     int32_t parameter_default[MACHINE_PARAMETERS_MAX];
     int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];
     uint32_t control_rate_min_hz; /* 25 periods in an electrical revolution at a highest speed that the file states */

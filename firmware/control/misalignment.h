@@ -24,7 +24,8 @@
  *
  *   N = rate / 8 D / s^2 = rate Ts (3 J w0^2 q)^2 / (48 s^2),   s = 0.00025 rad
  *
- * (derived here). A beat of the counts is not white: while there is one, nothing is learned from y (drive/deferred.c).
+ * (derived here). A beat of the counts is not white: while there is one, nothing is learned from y
+ * (interrupts/deferred.c).
  *
  * Both alternate with the strokes, so y and S pass through the same band-pass around their frequency: the slopes jump
  * where phases are turned on and off, and sampling them folds the harmonics of these jumps to frequencies far below,

@@ -16,7 +16,7 @@
 #define LAG_TENTHS 22
 #define LAG_MAX (UINT32_C(8) << VALUE_SHIFT)
 
-/* After a step that was left out, at the end of a stroke (drive/deferred.c), a value is ended late. */
+/* After a step that was left out, at the end of a stroke (interrupts/deferred.c), a value is ended late. */
 #define BEHIND_MAX 2u
 
 /* 1/256 of the largest torque in the mean. */

@@ -1,4 +1,4 @@
-/* Power cuts at every operation of the memory, as tests/unit/drive/test_nvm_store.cpp makes them on the host: the
+/* Power cuts at every operation of the memory, as tests/unit/storage/test_nvm_store.cpp makes them on the host: the
  * firmware compiled for the target, with the emulated flash in the memory of the board.
  *
  * Writes a line on standard error with single cuts, pairs of cuts, losses, mixed and failures of the sets of

@@ -16,11 +16,11 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "drive.h"
+#include "drive/drive.h"
+#include "drive/telemetry_collect.h"
 #include "hal_time.h"
 #include "qemu/board.h"
 #include "qemu/hal_qemu.h"
-#include "telemetry_collect.h"
 
 #define FRAME_ID 0x7A0
 #define DEFERRED_FRAME_ID 0x7A1

@@ -481,12 +481,12 @@ def test_observed_executions_contradict_a_model_that_excludes_them(tmp_path):
 @pytest.mark.parametrize(("text", "message"), [
     ('[[at_most]]\nfunction = "no_such"\ntimes = "1"\nreason = "r"', "no function no_such in the firmware"),
     ('[[never]]\nfunctions = ["no_such"]\nconfigurations = []\nreason = "r"', "no function no_such in the firmware"),
-    ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "while (tea)"\ntests = "1"\nreason = "r"',
-     r"firmware/drive.c has no loop while \(tea\)"),
-    ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\nreason = "r"', "must have either iterations or tests"),
-    ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\ntests = "1"', "reason"),
-    ('[[loop]]\nfile = "firmware/drive.c"\nstatement = "drive"\ntests = "1"\nreason = "r"', "has no loop drive"),
-    ('[[loops]]\nfile = "firmware/drive.c"', "loops"),
+    ('[[loop]]\nfile = "firmware/drive/drive.c"\nstatement = "while (tea)"\ntests = "1"\nreason = "r"',
+     r"firmware/drive/drive.c has no loop while \(tea\)"),
+    ('[[loop]]\nfile = "firmware/drive/drive.c"\nstatement = "drive"\nreason = "r"', "must have either iterations or tests"),
+    ('[[loop]]\nfile = "firmware/drive/drive.c"\nstatement = "drive"\ntests = "1"', "reason"),
+    ('[[loop]]\nfile = "firmware/drive/drive.c"\nstatement = "drive"\ntests = "1"\nreason = "r"', "has no loop drive"),
+    ('[[loops]]\nfile = "firmware/drive/drive.c"', "loops"),
 ])
 def test_mistake_in_the_file_of_facts_is_an_error(tmp_path, text, message):
     (tmp_path / "bounds.toml").write_text(text)

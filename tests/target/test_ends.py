@@ -24,7 +24,7 @@ COMPILERS = {
 }
 
 DRIVE = """
-#include "drive.h"
+#include "drive/drive.h"
 #include "hal_pwm.h"
 
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {

@@ -13,7 +13,7 @@
 
 extern "C" {
 #include "comms/e2e.h"
-#include "drive.h"
+#include "drive/drive.h"
 #include "drive_codec.h"
 #include "hal_adc.h"
 #include "hal_can.h"

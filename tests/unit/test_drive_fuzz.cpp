@@ -7,9 +7,9 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "drive/configure.h"
-#include "drive/control.h"
-#include "drive/deferred.h"
+#include "interrupts/configure.h"
+#include "interrupts/control_step.h"
+#include "interrupts/deferred.h"
 }
 #include "support/equal_parameters.h"
 #include "support/whole_sample.h"

@@ -8,7 +8,7 @@
 #include <memory>
 
 extern "C" {
-#include "drive.h"
+#include "drive/drive.h"
 #include "drive_codec.h"
 #include "host/hal_host.h"
 #include "rig/rig.h"

@@ -1,7 +1,7 @@
 /* One drive on a QEMU board: the firmware of the host executable, with its interrupts as real exceptions. */
 #include <string.h>
 
-#include "drive.h"
+#include "drive/drive.h"
 #include "hal_memory.h"
 #include "host/memory_flip.h"
 #include "qemu/board.h"

@@ -21,7 +21,7 @@ struct Texts {
 // By index; those of the drive are one text.
 const Texts TEXTS[PARAMETER_COUNT] = {
 #define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) {name, unit},
-#include "drive/parameters.def"
+#include "storage/parameters.def"
 #undef PARAMETER
 };
 

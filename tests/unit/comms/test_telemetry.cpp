@@ -9,9 +9,9 @@
 
 extern "C" {
 #include "comms/comms.h"
+#include "drive/telemetry_collect.h"
 #include "drive_codec.h"
 #include "hal_nvm.h"
-#include "telemetry_collect.h"
 }
 #include "support/frames.h"
 

@@ -10,8 +10,8 @@
 
 extern "C" {
 #include "control/predictive_torque.h"
-#include "drive/configure.h"
-#include "drive/deferred.h"
+#include "interrupts/configure.h"
+#include "interrupts/deferred.h"
 }
 
 #include "support/phase_map_results.h"

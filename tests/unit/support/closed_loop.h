@@ -12,9 +12,9 @@
 #include <vector>
 
 extern "C" {
-#include "drive/configure.h"
-#include "drive/control.h"
-#include "drive/deferred.h"
+#include "interrupts/configure.h"
+#include "interrupts/control_step.h"
+#include "interrupts/deferred.h"
 #include "plant/machine.h"
 #include "plant/plant.h"
 #include "plant/sensors.h"

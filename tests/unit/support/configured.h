@@ -7,7 +7,7 @@
 #include <utility>
 
 extern "C" {
-#include "drive/configure.h"
+#include "interrupts/configure.h"
 }
 
 #include "support/fixed_point.h"

@@ -6,7 +6,7 @@
 #include <type_traits>
 
 extern "C" {
-#include "drive/control.h"
+#include "interrupts/control_step.h"
 }
 
 template <typename member_t> bool equal_bytes(const member_t &a, const member_t &b) {

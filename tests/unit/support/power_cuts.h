@@ -13,9 +13,9 @@
 #include <stdint.h>
 #include <string.h>
 
-#include "drive/nvm_store.h"
-#include "drive/parameters.h"
 #include "rig/nvm.h"
+#include "storage/nvm_store.h"
+#include "storage/parameters.h"
 
 /* With errors of the memory while there is power, which are no operations of nvm_t. */
 struct hal {

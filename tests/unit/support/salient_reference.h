@@ -10,10 +10,10 @@
 #include <cmath>
 
 extern "C" {
-#include "drive/control.h"
-#include "drive/deferred.h"
-#include "drive/parameters.h"
+#include "interrupts/control_step.h"
+#include "interrupts/deferred.h"
 #include "plant/machine.h"
+#include "storage/parameters.h"
 }
 
 #include "support/reference_builders.h"

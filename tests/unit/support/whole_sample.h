@@ -3,7 +3,7 @@
 #define TESTS_UNIT_WHOLE_SAMPLE_H
 
 extern "C" {
-#include "drive/control.h"
+#include "interrupts/control_step.h"
 }
 
 struct whole_sample_t : control_sample_t {

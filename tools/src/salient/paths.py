@@ -20,7 +20,7 @@ MACHINES = ROOT / "tools" / "machines"
 LOADS = ROOT / "tools" / "loads"
 SCENARIOS = ROOT / "tools" / "scenarios"
 DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
-PARAMETERS = ROOT / "firmware" / "drive" / "parameters.def"
+PARAMETERS = ROOT / "firmware" / "storage" / "parameters.def"
 TAB_PAGE = ROOT / "tools" / "src" / "salient" / "tab" / "page"
 RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"
 

@@ -1,4 +1,4 @@
-# Written by python -m salient.bench.stubs from the CAN databases, firmware/drive/parameters.def and tools/loads.
+# Written by python -m salient.bench.stubs from the CAN databases, firmware/storage/parameters.def and tools/loads.
 # ruff: noqa
 from collections.abc import Sequence
 from typing import Any, Literal, overload

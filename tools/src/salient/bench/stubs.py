@@ -19,7 +19,7 @@ from salient.paths import LOADS
 FILE = Path(__file__).resolve().parents[1] / "suite.pyi"
 
 _HEAD = '''\
-# Written by python -m salient.bench.stubs from the CAN databases, firmware/drive/parameters.def and tools/loads.
+# Written by python -m salient.bench.stubs from the CAN databases, firmware/storage/parameters.def and tools/loads.
 # ruff: noqa
 from collections.abc import Sequence
 from typing import Any, Literal, overload

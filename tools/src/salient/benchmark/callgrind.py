@@ -21,7 +21,8 @@ from salient.paths import ROOT
 GROUPS = {
     "plant": ("emulator/plant/",),
     "control laws": ("firmware/control/", "firmware/fixed/"),
-    "drive": ("firmware/drive", "firmware/telemetry_collect", "hal/", "emulator/host/hal_host"),
+    "drive": ("firmware/drive/", "firmware/interrupts/", "firmware/monitors/", "firmware/storage/", "hal/",
+              "emulator/host/hal_host"),
     "CAN": ("firmware/comms/", "emulator/rig/can_", "emulator/rig/transport", "emulator/rig/truth", "/codec/"),
     "rig": ("emulator/rig/",),
 }

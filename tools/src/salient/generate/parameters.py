@@ -1,4 +1,4 @@
-"""Writes the reference page of the drive's parameters from their table, firmware/drive/parameters.def.
+"""Writes the reference page of the drive's parameters from their table, firmware/storage/parameters.def.
 
     python -m salient.generate.parameters
 
@@ -16,7 +16,7 @@ PAGE = ROOT / "firmware" / "PARAMETERS.md"
 
 _HEAD = """# Parameters of the drive
 
-Generated from `drive/parameters.def` by `python -m salient.generate.parameters`; do not edit.
+Generated from `storage/parameters.def` by `python -m salient.generate.parameters`; do not edit.
 
 The index addresses a parameter over CAN (`comms/drive.dbc`); the raw value has an LSB of 2^-(fraction bits) of the
 unit. Parameters are read with PARAMETER_REQUEST, and changed as a set that is applied as a whole

@@ -25,7 +25,7 @@ from salient.toml_file import TextFileError
 
 FILE, DERIVED, OVERRIDDEN, DEFAULT = "file", "derived", "overridden", "default"
 """Sources of a value: the table [drive] or another table of the machine file, a formula, [drive.parameters], the row of
-firmware/drive/parameters.def."""
+firmware/storage/parameters.def."""
 
 SAMPLES_PER_TURN_MIN = 25
 """Control periods of an electrical revolution at speed_max_rpm."""
@@ -81,7 +81,7 @@ class DriveData:
     torque_step_Nm: float
     """Torque of a phase that the highest voltage changes within a control period."""
     parameters: dict[str, float]
-    """Default of every parameter of firmware/drive/parameters.def by name."""
+    """Default of every parameter of firmware/storage/parameters.def by name."""
     derivations: tuple[Derivation, ...] = field(repr=False)
 
     @property

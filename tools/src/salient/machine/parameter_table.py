@@ -1,4 +1,4 @@
-"""The drive's parameters as firmware/drive/parameters.def has them."""
+"""The drive's parameters as firmware/storage/parameters.def has them."""
 
 from __future__ import annotations
 

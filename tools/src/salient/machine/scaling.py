@@ -45,7 +45,7 @@ SPEED_COMMAND_RPM = 3000.0
 """A frame of every drive may command up to this speed, of a faster machine up to its own; the drive limits it to the
 machine's."""
 SPEED_REFERENCE_PART = 7.0 / 8.0
-"""Part of over_speed_rpm to which the firmware limits a speed reference (firmware/drive/configure.c)."""
+"""Part of over_speed_rpm to which the firmware limits a speed reference (firmware/interrupts/configure.c)."""
 SPEED_LSB_RPM = Fraction(1, 1000)
 """Factor of the speeds in the DBC with SI units."""
 _COMMAND, _COMMAND_SIGNAL = "DRIVE_COMMAND", "speed_reference_rpm"

@@ -1,0 +1,13 @@
+/* Checks of the drive whose reaction may take longer than a few control periods, collected from the monitors. */
+#ifndef BACKGROUND_CHECKS_H
+#define BACKGROUND_CHECKS_H
+
+#include <stdint.h>
+
+#include "drive/drive.h"
+
+/* Follows currents, voltages, angle and heat, and reports the failed checks to the interrupts, which latch the first
+ * one. [background] */
+void background_checks(drive_t *drive, uint32_t time_us);
+
+#endif

@@ -1,0 +1,170 @@
+#include "storage/parameters.h"
+
+#include <assert.h>
+#include <string.h>
+
+#include "control/machine_tables.h"
+#include "fixed/compiler.h"
+#include "fixed/crc32.h"
+#include "fixed/fixed.h"
+
+#define Q FIXED_CONSTANT
+
+static const parameter_row_t rows[PARAMETER_COUNT] = {
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                             \
+    [PARAMETER_##index] = {minimum, maximum},
+#include "storage/parameters.def"
+#undef PARAMETER
+};
+
+static const uint64_t tunable = 0
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)
+#define TUNABLE_PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                     \
+    | UINT64_C(1) << PARAMETER_##index
+#include "storage/parameters.def"
+#undef PARAMETER
+    ;
+
+static_assert((int)PARAMETER_COUNT <= 64, "a bit each");
+
+/* Name and unit of each parameter in turn; pointers to them would take half as much flash again. */
+static const char texts[] =
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) name "\0" unit "\0"
+#include "storage/parameters.def"
+#undef PARAMETER
+    ;
+
+static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tables have a default of each parameter");
+
+void parameters_init(parameters_t *parameters) {
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        parameters->values[i] = machine_tables.parameter_default[i];
+    }
+    parameters->controller_default = machine_tables.parameter_default[PARAMETER_CONTROLLER];
+    parameters->revision = 0;
+}
+
+const parameter_row_t *parameters_row(unsigned index) {
+    return &rows[index];
+}
+
+static const char *text_after(unsigned texts_before) {
+    const char *text = texts;
+    for (; texts_before > 0; text++) {
+        texts_before -= *text == '\0';
+    }
+    return text;
+}
+
+const char *parameters_name(unsigned index) {
+    return text_after(2 * index);
+}
+
+const char *parameters_unit(unsigned index) {
+    return text_after(2 * index + 1);
+}
+
+void parameters_set(parameters_t *parameters, unsigned index, int32_t value) {
+    parameters->values[index] = fixed_clamp(value, rows[index].minimum, rows[index].maximum);
+    parameters->revision++;
+}
+
+void parameters_set_controller(parameters_t *parameters, int32_t controller) {
+    parameters_set(parameters, PARAMETER_CONTROLLER, controller);
+    parameters->controller_default = parameters->values[PARAMETER_CONTROLLER];
+}
+
+int32_t parameters_default(const parameters_t *parameters, unsigned index) {
+    return index == PARAMETER_CONTROLLER ? parameters->controller_default : machine_tables.parameter_default[index];
+}
+
+bool parameters_tunable(unsigned index) {
+    return (tunable >> index & 1) != 0;
+}
+
+static bool in_range(const int32_t values[PARAMETER_COUNT], unsigned index) {
+    return values[index] >= rows[index].minimum && values[index] <= rows[index].maximum;
+}
+
+static parameters_verdict_t check_each(const int32_t values[PARAMETER_COUNT], uint64_t written, bool running) {
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        if (!in_range(values, i)) {
+            return (parameters_verdict_t){PARAMETER_STATUS_OUT_OF_RANGE, (uint8_t)i, 0};
+        }
+    }
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        if (running && (written >> i & 1) != 0 && !parameters_tunable(i)) {
+            return (parameters_verdict_t){PARAMETER_STATUS_NOT_WHILE_RUNNING, (uint8_t)i, 0};
+        }
+    }
+    return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
+}
+
+/* Pairs of parameters with one unit: the first is not above the second, or below it. */
+static const struct {
+    uint8_t low, high;
+    bool below;
+} orders[] = {
+    {PARAMETER_CURRENT_LIMIT_A, PARAMETER_CURRENT_TRIP_A, false},
+    {PARAMETER_BUS_UNDER_VOLTAGE_V, PARAMETER_BUS_OVER_VOLTAGE_V, true},
+    {PARAMETER_TURN_ON_ANGLE_DEG, PARAMETER_TURN_OFF_ANGLE_DEG, true},
+    {PARAMETER_TURN_OFF_ANGLE_DEG, PARAMETER_OUTGOING_OFF_ANGLE_DEG, false},
+    {PARAMETER_TORQUE_BAND_INNER_NM, PARAMETER_TORQUE_BAND_OUTER_NM, false},
+};
+
+static parameters_verdict_t check_orders(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {
+    for (unsigned i = 0; i < sizeof orders / sizeof orders[0]; i++) {
+        const unsigned low = orders[i].low;
+        const bool kept = low == PARAMETER_CURRENT_LIMIT_A && values[low] == present->values[low];
+        const int32_t excess = values[low] - values[orders[i].high]; /* of values within their limits */
+        if (excess >= (orders[i].below ? 0 : 1) && !kept) {
+            return (parameters_verdict_t){PARAMETER_STATUS_CONTRADICTION, orders[i].low, orders[i].high};
+        }
+    }
+    return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
+}
+
+/* Of a drive without its supply nothing can be said. */
+static parameters_verdict_t check_supply(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
+                                         int32_t voltage_q6) {
+    const bool supplied = voltage_q6 >= present->values[PARAMETER_BUS_UNDER_VOLTAGE_V] &&
+                          voltage_q6 <= present->values[PARAMETER_BUS_OVER_VOLTAGE_V];
+    if (supplied && voltage_q6 < values[PARAMETER_BUS_UNDER_VOLTAGE_V]) {
+        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_BUS_UNDER_VOLTAGE_V, 0};
+    }
+    if (supplied && voltage_q6 > values[PARAMETER_BUS_OVER_VOLTAGE_V]) {
+        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_BUS_OVER_VOLTAGE_V, 0};
+    }
+    return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
+}
+
+parameters_verdict_t parameters_check(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
+                                      uint64_t written, const parameters_conditions_t *conditions) {
+    parameters_verdict_t verdict = check_each(values, written, conditions->running);
+    if (verdict.status == PARAMETER_STATUS_DONE) {
+        verdict = check_orders(present, values);
+    }
+    if (verdict.status == PARAMETER_STATUS_DONE) {
+        verdict = check_supply(present, values, conditions->dc_link_voltage_q6);
+    }
+    return verdict;
+}
+
+void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
+    memcpy(parameters->values, values, sizeof parameters->values);
+    parameters->revision++;
+}
+
+bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        if (!in_range(values, i)) {
+            return false;
+        }
+    }
+    parameters_apply(parameters, values);
+    return true;
+}
+
+COLD uint32_t parameters_identity(void) {
+    return crc32_continue(crc32_continue(0, texts, sizeof texts), rows, sizeof rows);
+}

@@ -1,0 +1,93 @@
+/* The drive's parameters, addressed by index over CAN; parameters.def is their table.
+ *
+ * A value is a raw 32-bit integer; its LSB is 2^-fraction_bits of its unit. Fraction bits and defaults are those of the
+ * machine (machine_tables): parameters.def has them for a machine whose units are the SI units.
+ */
+#ifndef STORAGE_PARAMETERS_H
+#define STORAGE_PARAMETERS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "drive_enumerations.h"
+
+#define PARAMETER_NAME_MAX 24 /* characters */
+
+typedef enum {
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) PARAMETER_##index,
+#include "storage/parameters.def"
+#undef PARAMETER
+    PARAMETER_COUNT
+} parameter_index_t;
+
+typedef struct {
+    int32_t minimum; /* both limits are inclusive */
+    int32_t maximum;
+} parameter_row_t;
+
+/* The values of one drive. Read `values` directly; write through the functions, so that every change is noticed. */
+typedef struct {
+    int32_t values[PARAMETER_COUNT];
+    int32_t controller_default;
+    uint32_t revision; /* incremented by every change, so that derived values can be recomputed */
+} parameters_t;
+
+/* Sets every value to the machine's default. */
+void parameters_init(parameters_t *parameters);
+
+/* The table's row; index 0..PARAMETER_COUNT-1. */
+const parameter_row_t *parameters_row(unsigned index);
+
+/* Name over CAN, at most PARAMETER_NAME_MAX ASCII characters; index 0..PARAMETER_COUNT-1. */
+const char *parameters_name(unsigned index);
+
+/* Unit, ASCII, empty for a plain number; index 0..PARAMETER_COUNT-1. */
+const char *parameters_unit(unsigned index);
+
+/* Sets one value before the drive starts, clamped to the row's limits; afterwards a whole set is applied. index
+ * 0..PARAMETER_COUNT-1. */
+void parameters_set(parameters_t *parameters, unsigned index, int32_t value);
+
+/* Sets the controller of this drive as default and present value, clamped to the row's limits. */
+void parameters_set_controller(parameters_t *parameters, int32_t controller);
+
+/* The default of this drive: that of the machine, but for the controller. index 0..PARAMETER_COUNT-1. */
+int32_t parameters_default(const parameters_t *parameters, unsigned index);
+
+/* What a set of parameters is checked against. */
+typedef struct {
+    bool running;               /* the drive runs or is about to: tunable parameters only */
+    int32_t dc_link_voltage_q6; /* measured, V, Q9.6 */
+} parameters_conditions_t;
+
+typedef struct {
+    parameter_status_t status;
+    uint8_t index, other; /* parameters for which the set is refused; other: of a contradiction */
+} parameters_verdict_t;
+
+/* True for a parameter that may be changed in a run; index 0..PARAMETER_COUNT-1. */
+bool parameters_tunable(unsigned index);
+
+/* Checks a set that is to replace the present one, in this order (written: bit i, the set has parameter i; the others
+ * have their present values):
+ *   PARAMETER_STATUS_OUT_OF_RANGE        a value is not within its limits
+ *   PARAMETER_STATUS_NOT_WHILE_RUNNING   in a run, a parameter is written that is not tunable, be it with its present
+ *                                        value
+ *   PARAMETER_STATUS_CONTRADICTION       a value is not below another one, or is above it; a current limit above the
+ *                                        trip only when the limit changes: lowering the trip alone is how it is tested
+ *   PARAMETER_STATUS_EXCLUDES_SUPPLY     a threshold of the DC-link voltage changes so that the present voltage, which
+ *                                        is within the present thresholds, would fail it
+ */
+parameters_verdict_t parameters_check(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
+                                      uint64_t written, const parameters_conditions_t *conditions);
+
+/* Sets every value at once. */
+void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
+
+/* As parameters_apply; false, with nothing changed, when a value is out of range. */
+bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
+
+/* CRC-32 of names, units and limits: differs from that of another list. */
+uint32_t parameters_identity(void);
+
+#endif

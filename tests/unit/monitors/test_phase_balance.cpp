@@ -1,0 +1,152 @@
+// Balance of the phases: which differences of one phase from the others are its sensor's.
+#include <cstdint>
+#include <utility>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "monitors/phase_balance.h"
+#include "storage/fault.h"
+}
+
+namespace {
+
+constexpr int32_t TABLE_Q29 = 1 << 27;
+constexpr uint32_t PERIODS_PER_REVOLUTION = 1000; // 25 ms at 40 kHz
+
+class PhaseBalance : public testing::Test {
+  protected:
+    void SetUp() override {
+        sample.run = true;
+        sample.phases = 3;
+        sample.least_q8 = PHASE_BALANCE_LEAST_Q8;
+        sample.elapsed = 1;
+        sample.periods_per_ms = 40;
+    }
+
+    // Eight electrical revolutions in each of which the phases conduct for a third, one after another.
+    uint32_t window(uint32_t periods = PERIODS_PER_REVOLUTION) {
+        sample.step = uint32_t((uint64_t(1) << 32) / periods) + 1;
+        uint32_t failed = 0;
+        for (uint32_t k = 0; k < 8 * periods; k++) {
+            for (unsigned phase = 0; phase < sample.phases; phase++) {
+                const bool conducts = k % periods * sample.phases / periods == phase && phase != silent;
+                sample.known[phase] = conducts && (phase != brief || k % periods % 16 == 0);
+                sample.table_q29[phase] = TABLE_Q29;
+                sample.flux_q29[phase] = int32_t(TABLE_Q29 * ratio[phase]);
+            }
+            failed = phase_balance_step(&balance, &sample);
+        }
+        return failed;
+    }
+
+    phase_balance_t balance{};
+    phase_balance_sample_t sample{};
+    unsigned silent = HAL_PHASES_MAX; // phase without current
+    unsigned brief = HAL_PHASES_MAX;  // phase that conducts for a sixteenth of its third
+    double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
+};
+
+TEST_F(PhaseBalance, a_phase_beyond_four_thirds_or_three_quarters_of_all_others_has_a_wrong_sensor) {
+    for (const double wrong : {1.36, 0.73}) {
+        ratio[1] = wrong;
+        EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR)) << wrong;
+        EXPECT_EQ(balance.phases, 2u);
+        balance = {};
+    }
+}
+
+TEST_F(PhaseBalance, a_phase_within_four_thirds_and_three_quarters_is_none) {
+    for (const double within : {1.31, 0.77}) {
+        ratio[1] = within;
+        EXPECT_EQ(window(), 0u) << within;
+        balance = {};
+    }
+}
+
+TEST_F(PhaseBalance, a_large_error_of_one_phase_accuses_no_other) {
+    ratio[2] = 3.0;
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+    EXPECT_EQ(balance.phases, 4u);
+}
+
+TEST_F(PhaseBalance, ratios_that_all_phases_have_are_no_sensor_s) {
+    for (const double common : {0.77, 1.3, 1.7}) {
+        ratio[0] = ratio[1] = ratio[2] = common;
+        EXPECT_EQ(window(), 0u) << common;
+        EXPECT_EQ(window(), 0u) << common;
+        balance = {};
+    }
+}
+
+TEST_F(PhaseBalance, a_small_ratio_of_all_is_the_encoder_s_after_two_windows) {
+    ratio[0] = ratio[1] = ratio[2] = 0.74;
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
+    EXPECT_EQ(balance.phases, 0u);
+}
+
+TEST_F(PhaseBalance, revolutions_beyond_100_ms_show_nothing) {
+    ratio[1] = 1.5;
+    EXPECT_EQ(window(4004), 0u);
+    EXPECT_EQ(window(3990), FAULT_BIT(FAULT_CURRENT_SENSOR));
+}
+
+TEST_F(PhaseBalance, nothing_is_judged_while_a_phase_does_not_conduct) {
+    ratio[1] = 1.5;
+    silent = 2;
+    EXPECT_EQ(window(), 0u);
+}
+
+TEST_F(PhaseBalance, a_phase_that_has_hardly_conducted_is_not_judged_whatever_it_did_in_the_window_before) {
+    EXPECT_EQ(window(), 0u);
+    ratio[1] = 1.5;
+    brief = 1;
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), 0u);
+    brief = HAL_PHASES_MAX;
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+}
+
+TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_three) {
+    sample.phases = 4;
+    for (const unsigned lost : {0u, 2u, 3u}) {
+        silent = lost;
+        sample.lost = 1u << lost;
+        for (const auto &[wrong, failed] :
+             {std::pair{1.36, FAULT_BIT(FAULT_CURRENT_SENSOR)}, std::pair{0.73, FAULT_BIT(FAULT_CURRENT_SENSOR)},
+              std::pair{1.3, uint64_t(0)}}) {
+            ratio[1] = wrong;
+            EXPECT_EQ(window(), failed) << lost << " " << wrong;
+            EXPECT_EQ(balance.phases, failed != 0 ? 2u : 0u);
+            balance = {};
+        }
+        ratio[1] = 1.0;
+    }
+}
+
+TEST_F(PhaseBalance, of_two_phases_that_are_left_neither_is_accused_of_a_difference_but_the_encoder_of_what_both_have) {
+    silent = 1;
+    sample.lost = 2u;
+    for (const double wrong : {3.0, 0.4}) {
+        ratio[2] = wrong;
+        EXPECT_EQ(window(), 0u) << wrong;
+        EXPECT_EQ(window(), 0u) << wrong;
+        balance = {};
+    }
+    ratio[0] = ratio[2] = 0.74;
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
+    EXPECT_EQ(balance.phases, 0u);
+}
+
+TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {
+    ratio[1] = 1.5;
+    ASSERT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+    ratio[1] = 1.0;
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+    sample.run = false;
+    EXPECT_EQ(phase_balance_step(&balance, &sample), 0u);
+}
+
+} // namespace
