@@ -10,8 +10,12 @@
 #define FAST_HZ 2666u
 #define SLOW_BITS_MAX 12u
 #define DEADBEAT_HZ 250u
+#define LATE_COUNTS 4
 #define PERIODS_MAX (UINT32_C(1) << 20)
 #define ONE_Q28 (1 << 28)
+
+/* 2 pi, Q3.28. */
+#define TWO_PI_Q28 INT64_C(1686629713)
 
 /* Slopes are in N m per 0.02 rad. */
 #define SLOPES_PER_RAD INT64_C(50)
@@ -33,6 +37,8 @@ slow_counts_parameters_t slow_counts_configure(uint32_t control_rate_hz, unsigne
         .deadbeat_periods = deadbeat_periods,
         .count = UINT32_C(1) << (32u - encoder_bits),
         .step_q31 = (uint32_t)INT32_MAX / deadbeat_periods,
+        .late_speed_q22 =
+            (int32_t)(LATE_COUNTS * DEADBEAT_HZ * TWO_PI_Q28 >> (6u + encoder_bits + machine_tables.speed_exponent)),
         .slope_gain_q16 = fixed_saturate(fixed_divide(slope_gain_q46, inertia_q30) << machine_tables.speed_exponent),
         .deadbeat = load_observer_deadbeat_gains(DEADBEAT_HZ, inertia_q30),
     };
@@ -61,10 +67,15 @@ static int32_t slope_factor_q12(const slow_counts_parameters_t *parameters, uint
     return ((ONE_Q16 + 48 * u_q8) << 12) / (ONE_Q16 + (15 * u_q8 >> 1));
 }
 
+/* 4 ms / periods, Q31, for more periods than 4 ms have. */
+static int32_t ratio_q31(const slow_counts_parameters_t *parameters, uint32_t periods) {
+    return (int32_t)(((parameters->deadbeat_periods << 16) / periods) << 15);
+}
+
 /* q = 0: l2 and l3 by the time between the edges. */
 static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t periods, int32_t slope_q24,
                          load_observer_gains_t *gains) {
-    const int32_t y_q31 = (int32_t)(((parameters->deadbeat_periods << 16) / periods) << 15);
+    const int32_t y_q31 = ratio_q31(parameters, periods);
     gains->angle_gain_q28 = ONE_Q28;
     gains->speed_gain_q24 = fixed_product_shift_saturate(product_q31(parameters->deadbeat.speed_gain_q24, y_q31),
                                                          slope_factor_q12(parameters, periods, slope_q24), 12);
@@ -79,6 +90,9 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
         counts->interval = counts->periods;
     }
     const bool long_since = passed >= parameters->slow_periods;
+    if (encoder_angle != counts->encoder_angle || passed <= parameters->deadbeat_periods) {
+        counts->speed_max_q22 = INT32_MAX; /* at once: an update follows some periods later */
+    }
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;
         counts->apart = passed < PERIODS_MAX ? passed : PERIODS_MAX;
@@ -92,6 +106,9 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
 
 NOINLINE void slow_counts_update(const slow_counts_parameters_t *parameters, slow_counts_t *counts, int32_t slope_q24) {
     const uint32_t coming = counts->interval + 1u;
+    if (counts->periods > parameters->deadbeat_periods) {
+        counts->speed_max_q22 = product_q31(parameters->late_speed_q22, ratio_q31(parameters, counts->periods));
+    }
     counts->late = coming > parameters->deadbeat_periods;
     counts->edge.load_factor_q4 = parameters->deadbeat.load_factor_q4;
     if (!counts->late) {

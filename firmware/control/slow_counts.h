@@ -31,6 +31,11 @@
  *
  * within 6 percent, 10 at the lower end, for u = -2.25..36, to which u is limited: a torque that falls with the angle
  * holds the rotor.
+ *
+ * A rotor that has not left its count for a time t turns slowly, whatever the model expects: from t = 4 ms on the
+ * magnitude of the estimated speed is at most 4 counts / t. Without this bound a rotor that is locked within a count
+ * may keep the speed of its reference for half a second, because the estimated load takes up what the edge corrects,
+ * and its stall shows that much later. 8 counts do as well; 2 disturb a rotor whose speed swings between the counts.
  */
 #ifndef CONTROL_SLOW_COUNTS_H
 #define CONTROL_SLOW_COUNTS_H
@@ -47,6 +52,7 @@ typedef struct {
     uint32_t count;                 /* 2^-32 rev */
     int32_t slope_gain_q16;         /* u of 4 ms for a slope in N m per 0.02 rad */
     uint32_t step_q31;              /* 1 / deadbeat_periods */
+    int32_t late_speed_q22;         /* 4 counts in 4 ms, rad/s, Q9.22 */
     load_observer_gains_t deadbeat; /* of edges that far apart, and of a prediction outside the count */
 } slow_counts_parameters_t;
 
@@ -58,6 +64,7 @@ typedef struct {
     uint32_t apart;         /* periods between the last two changes */
     bool slow;
     bool late;                  /* the interval is longer than 4 ms */
+    int32_t speed_max_q22;      /* largest magnitude of the speed until then, rad/s, Q9.22 */
     load_observer_gains_t edge; /* when the count changes, and when the prediction leaves it late */
 } slow_counts_t;
 
@@ -66,6 +73,7 @@ typedef struct {
     bool slow;
     bool late;
     uint32_t encoder_angle; /* of the last sample */
+    int32_t speed_max_q22;  /* while it is the same, rad/s, Q9.22 */
     load_observer_gains_t edge;
 } slow_counts_results_t;
 
@@ -77,13 +85,14 @@ bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t 
                       uint32_t angle, uint32_t periods);
 
 /* Gains of the coming samples, while counts are slow. slope_q24: K in N m per 0.02 rad, Q7.24. Products of 64 bits,
- * rounded down; three 32-bit divisions when no count changed for 4 ms. */
+ * rounded down; up to four 32-bit divisions when no count changed for 4 ms. */
 void slow_counts_update(const slow_counts_parameters_t *parameters, slow_counts_t *counts, int32_t slope_q24);
 
 /* All results but `slow`. */
 static inline void slow_counts_set(const slow_counts_t *counts, slow_counts_results_t *results) {
     results->late = counts->late;
     results->encoder_angle = counts->encoder_angle;
+    results->speed_max_q22 = counts->speed_max_q22;
     results->edge = counts->edge;
 }
 

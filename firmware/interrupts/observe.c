@@ -43,6 +43,10 @@ NOINLINE static const load_observer_gains_t *slow_gains(const control_parameters
                                                         const slow_counts_results_t *slow_counts,
                                                         const control_measurement_t *measured) {
     state->bandwidth.stage = OBSERVER_BANDWIDTH_STEADY_STAGE;
+    if (measured->encoder_angle == slow_counts->encoder_angle) {
+        const int32_t max_q22 = slow_counts->speed_max_q22;
+        state->observer.speed_q22 = fixed_clamp(state->observer.speed_q22, -max_q22, max_q22);
+    }
     return slow_counts_gains(&parameters->slow_counts, slow_counts, measured->encoder_angle);
 }
 

@@ -142,6 +142,15 @@ def test_a_rotor_that_swings_with_a_phase_lost_is_stalled(seed: int) -> None:
     assert result["causes"] == [14] and result["violations"] == []
 
 
+@pytest.mark.parametrize(("seed", "event"), [
+    (10824, "static_friction"), (20918, "shaft_locked"), (72251, "shaft_locked"), (90244, "shaft_locked")])
+def test_a_rotor_that_rests_between_coarse_counts_is_stalled_in_time(seed: int, event: str) -> None:
+    drawn = world(seed)
+    assert drawn["encoder_bits"] <= 12 and event in [each["event"] for each in drawn["events"]]
+    result = run_world(seed)
+    assert result["causes"][0] == 14 and result["violations"] == []
+
+
 def test_a_current_that_the_other_phases_hold_at_zero_does_not_stop_time() -> None:
     assert "winding_to_earth" in [drawn["event"] for drawn in world(904850)["events"]]
     result = run_world(904850)

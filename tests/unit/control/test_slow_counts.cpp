@@ -119,6 +119,20 @@ TEST_F(SlowCounts, have_the_gains_of_the_time_in_which_the_estimated_speed_passe
     EXPECT_NEAR(speed_gain(results.edge) * 702, speed * 401, 0.01 * speed * 401) << "a slower one";
 }
 
+TEST_F(SlowCounts, bound_the_speed_by_four_counts_in_the_time_since_the_last_one) {
+    wait(160);
+    EXPECT_EQ(results.speed_max_q22, INT32_MAX) << "not within 4 ms";
+    for (const uint32_t more : {1u, 39u, 200u, 3600u}) {
+        wait(more);
+        const double speed = 4 * COUNT_RAD * RATE_HZ / counts.periods;
+        EXPECT_NEAR(results.speed_max_q22 / Q22, speed, 1e-3 * speed) << counts.periods;
+    }
+    step(COUNT, 1);
+    EXPECT_EQ(results.speed_max_q22, INT32_MAX) << "a count";
+    wait(161, COUNT);
+    EXPECT_LT(results.speed_max_q22, INT32_MAX) << "waits again";
+}
+
 TEST_F(SlowCounts, leave_an_angle_uncertain_by_a_quarter_of_a_count_for_each_4_ms) {
     wait(80);
     EXPECT_NEAR(slow_counts_uncertain_angle(&parameters, &counts), COUNT / 8, COUNT / 500);
