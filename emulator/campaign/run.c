@@ -98,6 +98,6 @@ void run_to_end(run_t *run) {
     }
     rig_finish(&run->rig);
     oracle_finish(&run->oracle, &run->rig.plant,
-                  (oracle_heat_t){heat_winding_C(&run->rig), heat_inverter_C(&run->rig)});
+                  (oracle_heat_t){heat_winding_C(&run->rig.heat), heat_inverter_C(&run->rig.heat)});
     rig_close(&run->rig);
 }

@@ -2,14 +2,6 @@
 
 #include "rig/truth.h"
 
-void bus_start(rig_t *rig) {
-    rig_t *first = rig->first;
-    if (first->bus.start_requested) {
-        can_bus_start(&first->bus, rig->board.time_ns);
-        first->scheduler.due_ns[EVENT_CAN] = first->bus.next_event_ns;
-    }
-}
-
 void bus_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
     can_bus_delivery_t delivery;
@@ -38,7 +30,7 @@ void truth_event(void *context, uint64_t now_ns) {
     transport_frame_t frames[TRUTH_FRAMES];
     rig->scheduler.due_ns[EVENT_TRUTH] += rig->truth_period_ns;
     plant_advance(&rig->plant, now_ns);
-    truth_pack(rig, frames);
+    truth_pack(&rig->plant, &rig->heat, frames);
     for (unsigned i = 0; i < TRUTH_FRAMES; ++i) {
         transport_frame_set_node(&frames[i], rig->config.node);
         transport_send(rig->config.transport, now_ns, TRANSPORT_FROM_EMULATOR, &frames[i]);

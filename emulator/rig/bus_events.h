@@ -4,11 +4,7 @@
 
 #include <stdint.h>
 
-#include "rig/rig.h"
-
-/* Starts the bus when a frame was queued while it was idle. Required, before time runs on, after
- * everything that may queue frames. */
-void bus_start(rig_t *rig);
+#include "rig/rig_state.h"
 
 /* Handlers of EVENT_CAN, of the first rig, and EVENT_TRUTH; context is the rig. */
 void bus_event(void *context, uint64_t now_ns);

@@ -6,22 +6,31 @@
 #ifndef RIG_DYNAMOMETER_H
 #define RIG_DYNAMOMETER_H
 
-#include <stdint.h>
+#include <stdbool.h>
 
-#include "rig/rig.h"
+#include "plant/plant.h"
+#include "rig/scheduler.h"
 
 #define DYNAMOMETER_RPM_S 10000.0
 
-/* The bench variable of this name, from the present time on. */
-void dynamometer_set_speed(rig_t *rig, double speed_rpm);
+typedef struct {
+    plant_t *plant;
+    scheduler_t *scheduler; /* with EVENT_DYNAMOMETER */
+    double speed_rpm;       /* held_speed_rpm as set */
+    double speed_rad_s;     /* where its acceleration ends */
+    bool locked;
+} dynamometer_t;
 
-/* A free shaft that is not locked. */
-void dynamometer_init(rig_t *rig);
+/* A free shaft that is not locked. Keeps plant and scheduler. */
+void dynamometer_init(dynamometer_t *dynamometer, plant_t *plant, scheduler_t *scheduler);
+
+/* The bench variable held_speed_rpm, from the present time on. */
+void dynamometer_set_speed(dynamometer_t *dynamometer, double speed_rpm);
 
 /* Locks the shaft at once, or unlocks it: then held_speed_rpm is as it was last set. */
-void dynamometer_lock(rig_t *rig, bool locked);
+void dynamometer_lock(dynamometer_t *dynamometer, bool locked);
 
-/* Handler of EVENT_DYNAMOMETER; context is the rig. */
-void dynamometer_event(void *context, uint64_t now_ns);
+/* EVENT_DYNAMOMETER: the shaft has the speed at which it is held. */
+void dynamometer_end_acceleration(dynamometer_t *dynamometer);
 
 #endif

@@ -6,6 +6,7 @@
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
+#include "rig/memory_flips.h"
 #include "rig/supply.h"
 #include "rig/truth.h"
 #include "rig_codec.h"
@@ -13,7 +14,7 @@
 #define NS_PER_US UINT64_C(1000)
 #define PERCENT 0.01
 
-_Static_assert(FAULT_COUNT <= RIG_FAULT_KINDS_MAX, "room for every kind");
+_Static_assert(FAULT_COUNT <= FAULT_KINDS_MAX, "room for every kind");
 
 /* Kind and place of a fault as one number, for the queue. */
 static unsigned pack(const fault_request_t *request) {
@@ -22,13 +23,12 @@ static unsigned pack(const fault_request_t *request) {
 }
 
 void faults_init(rig_t *rig) {
-    rig->fault_changes.count = 0;
-    memset(rig->flipped, 0, sizeof rig->flipped);
-    memset(&rig->faults, 0, sizeof rig->faults);
+    rig->faults.changes.count = 0;
+    memset(&rig->faults.present, 0, sizeof rig->faults.present);
 }
 
 static const fault_presence_t *at(const rig_t *rig, unsigned kind, unsigned phase, unsigned leg) {
-    return &rig->faults[kind][phase][leg];
+    return &rig->faults.present[kind][phase][leg];
 }
 
 static bool present(const rig_t *rig, unsigned kind) {
@@ -139,23 +139,23 @@ static void apply_encoder(rig_t *rig) {
 
 static void apply_supply(rig_t *rig) {
     const double factor = 1.0 - PERCENT * value(rig, FAULT_SUPPLY_SAGGED) + PERCENT * value(rig, FAULT_SUPPLY_SURGED);
-    supply_set_fault(rig, present(rig, FAULT_SUPPLY_LOST) ? 0.0 : factor,
+    supply_set_fault(&rig->supply, present(rig, FAULT_SUPPLY_LOST) ? 0.0 : factor,
                      present(rig, FAULT_SUPPLY_LOST) ? 0.0 : value(rig, FAULT_SUPPLY_RIPPLE));
 }
 
 static void apply_lock(rig_t *rig) {
-    dynamometer_lock(rig, present(rig, FAULT_SHAFT_LOCKED));
+    dynamometer_lock(&rig->dynamometer, present(rig, FAULT_SHAFT_LOCKED));
 }
 
 static void apply_load(rig_t *rig) {
-    load_drop(rig, present(rig, FAULT_LOAD_DROPPED));
+    load_drop(&rig->load, present(rig, FAULT_LOAD_DROPPED));
 }
 
 static void apply_processor(rig_t *rig) {
     const bool storm = present(rig, FAULT_INTERRUPT_STORM);
-    rig->interrupts_lost = present(rig, FAULT_INTERRUPT_LOST) || storm;
-    rig->background_hung = present(rig, FAULT_BACKGROUND_HUNG) || storm;
-    rig->interrupt_late_ns = (uint64_t)value(rig, FAULT_INTERRUPT_LATE) * NS_PER_US;
+    rig->control_period.interrupts_lost = present(rig, FAULT_INTERRUPT_LOST) || storm;
+    rig->control_period.background_hung = present(rig, FAULT_BACKGROUND_HUNG) || storm;
+    rig->control_period.interrupt_late_ns = (uint64_t)value(rig, FAULT_INTERRUPT_LATE) * NS_PER_US;
 }
 
 static void apply_temperature_sensors(rig_t *rig) {
@@ -183,24 +183,10 @@ static const unsigned flip_kinds[MEMORY_OBJECTS] = {
 };
 
 static void apply_flips(rig_t *rig) {
+    control_period_t *period = &rig->control_period;
     for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
-        const bool flips = present(rig, flip_kinds[object]);
-        const uint32_t bit = (uint32_t)value(rig, flip_kinds[object]);
-        if (rig->flipped[object] && !(flips && rig->flipped_bit[object] == bit)) {
-            rig->flipped[object] = false;
-            rig->firmware.flip(rig->firmware.context, (memory_object_t)object, rig->flipped_bit[object]);
-        }
-        if (flips && !rig->flipped[object]) {
-            rig->flipped[object] = true;
-            rig->flipped_bit[object] = bit;
-            rig->firmware.flip(rig->firmware.context, (memory_object_t)object, bit);
-        }
-    }
-}
-
-void faults_drive_reset(rig_t *rig) {
-    for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
-        rig->flipped[object] = rig->flipped[object] && object == MEMORY_CODE;
+        memory_flips_set(&period->flips, &period->firmware, (memory_object_t)object, present(rig, flip_kinds[object]),
+                         (uint32_t)value(rig, flip_kinds[object]));
     }
 }
 
@@ -212,7 +198,7 @@ static void apply_period_register(rig_t *rig) {
     rig->board.period_ticks = present(rig, FAULT_PERIOD_REGISTER_FLIPPED)
                                   ? flipped_period_ticks(rig, value(rig, FAULT_PERIOD_REGISTER_FLIPPED))
                                   : rig->board.period_written;
-    control_period_set_length(rig);
+    control_period_set_length(&rig->control_period);
 }
 
 static void apply_clock(rig_t *rig) {
@@ -285,7 +271,7 @@ static const effect_t effects[FAULT_COUNT] = {
 static void change(rig_t *rig, unsigned packed, double attribute) {
     const unsigned kind = packed & 0xFFu, phase = packed >> 8 & 3u, leg = packed >> 10 & 1u;
     const bool begins = packed >> 11 & 1u;
-    rig->faults[kind][phase][leg] = (fault_presence_t){.present = begins, .value = attribute};
+    rig->faults.present[kind][phase][leg] = (fault_presence_t){.present = begins, .value = attribute};
     plant_advance(&rig->plant, rig->board.time_ns);
     effects[kind](rig);
     transport_frame_t frame;
@@ -295,13 +281,13 @@ static void change(rig_t *rig, unsigned packed, double attribute) {
 }
 
 static void schedule(rig_t *rig) {
-    rig->scheduler.due_ns[EVENT_FAULT] = stimulus_queue_next_ns(&rig->fault_changes);
+    rig->scheduler.due_ns[EVENT_FAULT] = stimulus_queue_next_ns(&rig->faults.changes);
 }
 
 void faults_event(void *context, uint64_t now_ns) {
     (void)now_ns;
     rig_t *rig = context;
-    const stimulus_t next = stimulus_queue_pop(&rig->fault_changes);
+    const stimulus_t next = stimulus_queue_pop(&rig->faults.changes);
     schedule(rig);
     change(rig, next.variable, next.value);
 }
@@ -316,12 +302,12 @@ static bool unsupported(const rig_t *rig, const fault_request_t *request) {
                rig->plant.machine->dc_link.chopper_resistance_ohm == 0.0;
     }
     if (kind == FAULT_PERIOD_REGISTER_FLIPPED) { /* the timer of a target whose instructions take time is its own */
-        return !rig->firmware.restart ||
+        return !rig->control_period.firmware.restart ||
                (request->begins && flipped_period_ticks(rig, (double)request->raw) < PERIOD_TICKS_MIN);
     }
     for (unsigned object = 0; object < MEMORY_OBJECTS; object++) {
         if (kind == flip_kinds[object]) {
-            return (rig->firmware.flip_objects >> object & 1u) == 0;
+            return (rig->control_period.firmware.flip_objects >> object & 1u) == 0;
         }
     }
     return false;
@@ -363,7 +349,7 @@ uint8_t faults_receive(rig_t *rig, const uint8_t *data) {
         change(rig, entry.variable, entry.value);
     } else if (entry.at_ns < rig->board.time_ns) {
         return RIG_FAULT_REPLY_STATUS_IN_THE_PAST_CHOICE;
-    } else if (!stimulus_queue_push(&rig->fault_changes, &entry)) {
+    } else if (!stimulus_queue_push(&rig->faults.changes, &entry)) {
         return RIG_FAULT_REPLY_STATUS_QUEUE_FULL_CHOICE;
     }
     schedule(rig);

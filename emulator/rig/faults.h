@@ -8,7 +8,7 @@
 
 #include <stdint.h>
 
-#include "rig/rig.h"
+#include "rig/rig_state.h"
 
 /* No faults. */
 void faults_init(rig_t *rig);
@@ -16,9 +16,6 @@ void faults_init(rig_t *rig);
 /* Takes the data of a RIG_FAULT: changes the fault when its time is 0 or the present, else schedules the change. The
  * answer is RIG_FAULT_REPLY_STATUS_*_CHOICE. */
 uint8_t faults_receive(rig_t *rig, const uint8_t *data);
-
-/* The drive starts again: of its memory only the program keeps a flipped bit. */
-void faults_drive_reset(rig_t *rig);
 
 /* Handler of EVENT_FAULT; context is the rig. */
 void faults_event(void *context, uint64_t now_ns);

@@ -1,8 +1,8 @@
 #include "rig/heat.h"
 
 #include <math.h>
-#include <string.h>
 
+#include "hal_adc.h"
 #include "rig_codec.h"
 
 #define AMBIENT_C 25.0
@@ -24,25 +24,24 @@ static uint16_t code_of(const sensors_input_fault_t *fault, double temperature_C
     return (uint16_t)fmin(fmax(converted, 0.0), CODES - 1.0) & CODE_12_BITS;
 }
 
-static void convert(rig_t *rig) {
-    const heat_t *heat = &rig->heat;
+static void convert(const heat_t *heat) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        rig->board.temperature_code[HAL_ADC_WINDING + phase] =
+        heat->codes[HAL_ADC_WINDING + phase] =
             code_of(&heat->winding.sensor_fault[phase], heat->winding.temperature_C[phase]);
-        rig->board.temperature_code[HAL_ADC_INVERTER + phase] =
+        heat->codes[HAL_ADC_INVERTER + phase] =
             code_of(&heat->inverter.sensor_fault[phase], heat->inverter.temperature_C[phase]);
     }
 }
 
-void heat_init(rig_t *rig) {
-    memset(&rig->heat, 0, sizeof rig->heat);
-    rig->heat.ambient_C = AMBIENT_C;
-    rig->heat.winding.held_C = rig->heat.inverter.held_C = free_C();
+void heat_init(heat_t *heat, plant_t *plant, uint16_t *codes) {
+    *heat = (heat_t){.plant = plant, .codes = codes};
+    heat->ambient_C = AMBIENT_C;
+    heat->winding.held_C = heat->inverter.held_C = free_C();
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        rig->heat.winding.temperature_C[phase] = rig->heat.inverter.temperature_C[phase] = AMBIENT_C;
-        rig->heat.resistance_C[phase] = PLANT_RESISTANCE_C;
+        heat->winding.temperature_C[phase] = heat->inverter.temperature_C[phase] = AMBIENT_C;
+        heat->resistance_C[phase] = PLANT_RESISTANCE_C;
     }
-    convert(rig);
+    convert(heat);
 }
 
 /* loss_J: since the plant's begin, per phase. */
@@ -58,10 +57,9 @@ static void step(heat_bodies_t *bodies, const double *loss_J, double capacity_J_
     }
 }
 
-static void follow_resistances(rig_t *rig) {
-    heat_t *heat = &rig->heat;
+static void follow_resistances(heat_t *heat) {
     bool changed = false;
-    for (unsigned phase = 0; phase < rig->plant.machine->phases; phase++) {
+    for (unsigned phase = 0; phase < heat->plant->machine->phases; phase++) {
         const double temperature_C = heat->winding.temperature_C[phase];
         if (fabs(temperature_C - heat->resistance_C[phase]) >= FOLLOWED_K) {
             heat->resistance_C[phase] = temperature_C;
@@ -69,13 +67,12 @@ static void follow_resistances(rig_t *rig) {
         }
     }
     if (changed) {
-        plant_set_winding_temperatures(&rig->plant, heat->resistance_C);
+        plant_set_winding_temperatures(heat->plant, heat->resistance_C);
     }
 }
 
-void heat_step(rig_t *rig) {
-    heat_t *heat = &rig->heat;
-    const plant_t *plant = &rig->plant;
+void heat_step(heat_t *heat) {
+    const plant_t *plant = heat->plant;
     if (plant->time_ns - heat->time_ns < STEP_NS) {
         return;
     }
@@ -86,22 +83,22 @@ void heat_step(rig_t *rig) {
     step(&heat->inverter, plant->phase_converter_J, data->inverter_capacity_J_K, data->inverter_resistance_K_W,
          heat->ambient_C, step_s);
     heat->time_ns = plant->time_ns;
-    follow_resistances(rig);
-    convert(rig);
+    follow_resistances(heat);
+    convert(heat);
 }
 
-static double hottest_C(const rig_t *rig, const heat_bodies_t *bodies) {
+static double hottest_C(const heat_t *heat, const heat_bodies_t *bodies) {
     double hottest_C = bodies->temperature_C[0];
-    for (unsigned phase = 1; phase < rig->plant.machine->phases; phase++) {
+    for (unsigned phase = 1; phase < heat->plant->machine->phases; phase++) {
         hottest_C = fmax(hottest_C, bodies->temperature_C[phase]);
     }
     return hottest_C;
 }
 
-double heat_winding_C(const rig_t *rig) {
-    return hottest_C(rig, &rig->heat.winding);
+double heat_winding_C(const heat_t *heat) {
+    return hottest_C(heat, &heat->winding);
 }
 
-double heat_inverter_C(const rig_t *rig) {
-    return hottest_C(rig, &rig->heat.inverter);
+double heat_inverter_C(const heat_t *heat) {
+    return hottest_C(heat, &heat->inverter);
 }

@@ -13,16 +13,37 @@
 #ifndef RIG_HEAT_H
 #define RIG_HEAT_H
 
-#include "rig/rig.h"
+#include <stdint.h>
 
-/* Every body at ambient temperature. */
-void heat_init(rig_t *rig);
+#include "hal.h"
+#include "plant/plant.h"
+#include "plant/sensors.h"
+
+/* Bodies of one kind, one in each phase, and their temperature sensors. */
+typedef struct {
+    double temperature_C[HAL_PHASES_MAX];
+    double loss_J[HAL_PHASES_MAX];                      /* of the plant, at the last step */
+    double held_C;                                      /* a variable of the bench */
+    sensors_input_fault_t sensor_fault[HAL_PHASES_MAX]; /* code: of 16 bits; offset in K */
+} heat_bodies_t;
+
+typedef struct {
+    plant_t *plant;
+    uint16_t *codes;  /* of the sensors, where the board has them */
+    uint64_t time_ns; /* of the last step */
+    double ambient_C;
+    heat_bodies_t winding, inverter;
+    double resistance_C[HAL_PHASES_MAX]; /* temperatures of the windings that the plant's resistances are for */
+} heat_t;
+
+/* Every body at ambient temperature. Keeps plant and codes, of HAL_ADC_TEMPERATURES sensors. */
+void heat_init(heat_t *heat, plant_t *plant, uint16_t *codes);
 
 /* Takes a step when a millisecond has passed since the last one, at the time of the plant. */
-void heat_step(rig_t *rig);
+void heat_step(heat_t *heat);
 
 /* Temperature of the hottest winding and of the hottest switches. */
-double heat_winding_C(const rig_t *rig);
-double heat_inverter_C(const rig_t *rig);
+double heat_winding_C(const heat_t *heat);
+double heat_inverter_C(const heat_t *heat);
 
 #endif

@@ -12,6 +12,39 @@
 
 #define TRUTH_PERIOD_DEFAULT_NS UINT64_C(1000000)
 
+/* --- Events, each for the part of the rig that it belongs to --- */
+
+static void supply_event(void *context, uint64_t now_ns) {
+    (void)now_ns;
+    supply_step(&((rig_t *)context)->supply);
+}
+
+static void load_event(void *context, uint64_t now_ns) {
+    (void)now_ns;
+    load_step(&((rig_t *)context)->load);
+}
+
+static void dynamometer_event(void *context, uint64_t now_ns) {
+    (void)now_ns;
+    dynamometer_end_acceleration(&((rig_t *)context)->dynamometer);
+}
+
+static void hold_event(void *context, uint64_t now_ns) {
+    control_period_hold(&((rig_t *)context)->control_period, now_ns);
+}
+
+static void control_event(void *context, uint64_t now_ns) {
+    control_period_start(&((rig_t *)context)->control_period, now_ns);
+}
+
+static void background_event(void *context, uint64_t now_ns) {
+    control_period_resume_background(&((rig_t *)context)->control_period, now_ns);
+}
+
+static void watchdog_event(void *context, uint64_t now_ns) {
+    control_period_watch(&((rig_t *)context)->control_period, now_ns);
+}
+
 static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_BENCH_VARIABLE] = stimulus_event,
     [EVENT_FAULT] = faults_event,
@@ -19,12 +52,14 @@ static const scheduler_handler_t handlers[EVENT_COUNT] = {
     [EVENT_LOAD] = load_event,
     [EVENT_DYNAMOMETER] = dynamometer_event,
     [EVENT_CAN] = bus_event,
-    [EVENT_CURRENT_HOLD] = control_period_hold_event,
-    [EVENT_CONTROL] = control_period_start_event,
-    [EVENT_BACKGROUND] = control_period_background_event,
-    [EVENT_WATCHDOG] = control_period_watchdog_event,
+    [EVENT_CURRENT_HOLD] = hold_event,
+    [EVENT_CONTROL] = control_event,
+    [EVENT_BACKGROUND] = background_event,
+    [EVENT_WATCHDOG] = watchdog_event,
     [EVENT_TRUTH] = truth_event,
 };
+
+/* --- A rig --- */
 
 /* Everything but what the rigs of a list share. */
 static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_t *config) {
@@ -34,23 +69,25 @@ static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_
     board_init(&rig->board, &rig->plant, &rig->sensors, &first->bus, bus_drive, config->seed);
     rig->board.immediate_pwm = config->immediate_pwm;
     rig->board.nvm.random = config->seed;
-    rig->first = first;
     rig->next = NULL;
     rig->config = *config;
-    rig->firmware = (rig_firmware_t){0};
     rig->observer = (rig_observer_t){0};
     scheduler_init(&rig->scheduler, &rig->board.time_ns, handlers, rig);
-    rig->period_ns = 0;
+    rig->shared_bus = (shared_bus_t){.bus = &first->bus, .scheduler = &first->scheduler};
     rig->truth_period_ns = config->drive_only ? 0 : TRUTH_PERIOD_DEFAULT_NS;
     rig->scheduler.due_ns[EVENT_TRUTH] = config->drive_only ? SCHEDULER_NEVER : TRUTH_PERIOD_DEFAULT_NS;
-    rig->interrupt_time_ns = rig->interrupt_end_ns = 0;
     rig->stimuli.count = 0;
-    rig->interrupts_lost = rig->background_hung = false;
-    rig->interrupt_late_ns = 0;
-    load_init(rig);
-    supply_init(rig);
-    dynamometer_init(rig);
-    heat_init(rig);
+    load_init(&rig->load, &rig->plant, &rig->scheduler);
+    supply_init(&rig->supply, &rig->plant, &rig->scheduler);
+    dynamometer_init(&rig->dynamometer, &rig->plant, &rig->scheduler);
+    heat_init(&rig->heat, &rig->plant, rig->board.temperature_code);
+    control_period_init(&rig->control_period, &(control_period_t){.plant = &rig->plant,
+                                                                  .sensors = &rig->sensors,
+                                                                  .board = &rig->board,
+                                                                  .heat = &rig->heat,
+                                                                  .scheduler = &rig->scheduler,
+                                                                  .shared_bus = rig->shared_bus,
+                                                                  .observer = &rig->observer});
     faults_init(rig);
 }
 
@@ -71,30 +108,12 @@ void rig_add(rig_t *first, rig_t *rig, const rig_config_t *config) {
 }
 
 void rig_join(rig_t *rig, const rig_firmware_t *firmware) {
-    rig->firmware = *firmware;
-    control_period_begin(rig);
-}
-
-bool rig_reset_drive(rig_t *rig, hal_reset_cause_t cause) {
-    if (!rig->firmware.restart) {
-        return false;
-    }
-    plant_advance(&rig->plant, rig->board.time_ns);
-    board_reset(&rig->board, cause);
-    rig->interrupt_end_ns = 0;
-    faults_drive_reset(rig);
-    rig->scheduler.due_ns[EVENT_CONTROL] = rig->scheduler.due_ns[EVENT_CURRENT_HOLD] =
-        rig->scheduler.due_ns[EVENT_BACKGROUND] = SCHEDULER_NEVER;
-    rig->firmware.restart(rig->firmware.context);
-    if (rig->observer.after_restart) {
-        rig->observer.after_restart(rig->observer.context);
-    }
-    control_period_begin(rig);
-    return true;
+    rig->control_period.firmware = *firmware;
+    control_period_begin(&rig->control_period);
 }
 
 void rig_busy_until(rig_t *rig, uint64_t time_ns) {
-    rig->interrupt_end_ns = time_ns;
+    rig->control_period.interrupt_end_ns = time_ns;
 }
 
 bool rig_serve(rig_t *rig, int timeout_ms) {

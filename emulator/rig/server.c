@@ -2,7 +2,6 @@
 
 #include <string.h>
 
-#include "rig/bus_events.h"
 #include "rig/faults.h"
 #include "rig/load.h"
 #include "rig/stimulus.h"
@@ -33,8 +32,8 @@ void server_init(rig_t *rig) {
     transport->unstamped = rig->config.drive_only;
     transport->give_up = give_up;
     transport->give_up_context = rig;
-    rig->run_count = 0;
-    rig->stop_checked_ns = 0;
+    rig->server.run_count = 0;
+    rig->server.stop_checked_ns = 0;
 }
 
 static void send_clock(rig_t *rig, uint8_t sequence) {
@@ -48,12 +47,12 @@ static void send_clock(rig_t *rig, uint8_t sequence) {
 
 /* Runs to until_ns and answers the RIG_RUN_UNTILs on the way, each at its time. */
 static void advance(rig_t *rig, uint64_t until_ns) {
-    while (rig->run_count > 0 && rig->runs[0].time_ns <= until_ns) {
-        if (rig->runs[0].time_ns > rig->board.time_ns) {
-            scheduler_run(&rig->scheduler, rig->runs[0].time_ns);
+    while (rig->server.run_count > 0 && rig->server.runs[0].time_ns <= until_ns) {
+        if (rig->server.runs[0].time_ns > rig->board.time_ns) {
+            scheduler_run(&rig->scheduler, rig->server.runs[0].time_ns);
         }
-        uint8_t sequence = rig->runs[0].sequence;
-        memmove(&rig->runs[0], &rig->runs[1], --rig->run_count * sizeof rig->runs[0]);
+        uint8_t sequence = rig->server.runs[0].sequence;
+        memmove(&rig->server.runs[0], &rig->server.runs[1], --rig->server.run_count * sizeof rig->server.runs[0]);
         send_clock(rig, sequence);
     }
     scheduler_run(&rig->scheduler, until_ns);
@@ -62,15 +61,16 @@ static void advance(rig_t *rig, uint64_t until_ns) {
 static void take_run_until(rig_t *rig, uint32_t client, const uint8_t *data) {
     struct rig_run_until_t message;
     rig_run_until_unpack(&message, data, RIG_RUN_UNTIL_LENGTH);
-    if (message.time_ns <= rig->board.time_ns || rig->run_count == RIG_RUNS_MAX) {
+    if (message.time_ns <= rig->board.time_ns || rig->server.run_count == SERVER_RUNS_MAX) {
         send_clock(rig, message.sequence);
         return;
     }
-    unsigned index = rig->run_count++;
-    for (; index > 0 && rig->runs[index - 1].time_ns > message.time_ns; --index) {
-        rig->runs[index] = rig->runs[index - 1];
+    unsigned index = rig->server.run_count++;
+    for (; index > 0 && rig->server.runs[index - 1].time_ns > message.time_ns; --index) {
+        rig->server.runs[index] = rig->server.runs[index - 1];
     }
-    rig->runs[index] = (rig_run_t){.time_ns = message.time_ns, .sequence = message.sequence, .client = client};
+    rig->server.runs[index] =
+        (server_run_t){.time_ns = message.time_ns, .sequence = message.sequence, .client = client};
 }
 
 static void take_set(rig_t *rig, const uint8_t *data) {
@@ -97,7 +97,7 @@ static void take_fault(rig_t *rig, const uint8_t *data) {
 static void take_load_profile(rig_t *rig, const uint8_t *data) {
     struct rig_load_profile_t message;
     rig_load_profile_unpack(&message, data, RIG_LOAD_PROFILE_LENGTH);
-    load_set_profile_value(rig, message.values, message.index, (double)message.value * LOAD_PROFILE_LSB);
+    load_set_profile_value(&rig->load, message.values, message.index, (double)message.value * LOAD_PROFILE_LSB);
 }
 
 static bool may_read(void *context, uint32_t client) {
@@ -105,8 +105,8 @@ static bool may_read(void *context, uint32_t client) {
     if (rig->config.pacing.kind != PACING_LOCKSTEP) {
         return can_bus_client_backlog(&rig->bus, client) < RIG_MOVING_BACKLOG_MAX;
     }
-    for (unsigned i = 0; i < rig->run_count; ++i) {
-        if (rig->runs[i].client == client) {
+    for (unsigned i = 0; i < rig->server.run_count; ++i) {
+        if (rig->server.runs[i].client == client) {
             return false;
         }
     }
@@ -154,12 +154,12 @@ static bool take(void *context, uint32_t client, const transport_frame_t *frame)
 }
 
 static bool check_stop(rig_t *rig) {
-    rig->stop_checked_ns = rig->board.time_ns;
+    rig->server.stop_checked_ns = rig->board.time_ns;
     return stop_requested(rig);
 }
 
 static bool check_stop_when_due(rig_t *rig) {
-    return rig->board.time_ns - rig->stop_checked_ns >= RIG_STOP_STEP_NS && check_stop(rig);
+    return rig->board.time_ns - rig->server.stop_checked_ns >= RIG_STOP_STEP_NS && check_stop(rig);
 }
 
 /* True when one of the stop descriptors became readable. */
@@ -175,28 +175,28 @@ static bool wait_for_clients(rig_t *rig, int timeout_ms) {
 /* Removes the runs of clients that have left, when there is another client to be served; true when one was removed. */
 static bool abandon_runs(rig_t *rig) {
     transport_t *transport = rig->config.transport;
-    if (transport_connected(transport, rig->runs[0].client) || !transport_in_use(transport)) {
+    if (transport_connected(transport, rig->server.runs[0].client) || !transport_in_use(transport)) {
         return false;
     }
     unsigned kept = 0;
-    for (unsigned i = 0; i < rig->run_count; ++i) {
-        if (transport_connected(transport, rig->runs[i].client)) {
-            rig->runs[kept++] = rig->runs[i];
+    for (unsigned i = 0; i < rig->server.run_count; ++i) {
+        if (transport_connected(transport, rig->server.runs[i].client)) {
+            rig->server.runs[kept++] = rig->server.runs[i];
         }
     }
-    rig->run_count = kept;
+    rig->server.run_count = kept;
     return true;
 }
 
 static bool serve_lockstep(rig_t *rig, int timeout_ms) {
-    if (rig->run_count == 0) {
+    if (rig->server.run_count == 0) {
         transport_flush(rig->config.transport);
         return !(wait_for_clients(rig, timeout_ms) && check_stop(rig));
     }
-    bus_start(rig);
-    uint64_t target_ns = rig->runs[0].time_ns;
+    shared_bus_start(&rig->shared_bus);
+    uint64_t target_ns = rig->server.runs[0].time_ns;
     while (rig->board.time_ns < target_ns && !abandon_runs(rig)) {
-        advance(rig, earlier(target_ns, rig->stop_checked_ns + RIG_STOP_STEP_NS));
+        advance(rig, earlier(target_ns, rig->server.stop_checked_ns + RIG_STOP_STEP_NS));
         if (rig->config.transport->failure || check_stop_when_due(rig)) {
             return false;
         }
@@ -206,7 +206,7 @@ static bool serve_lockstep(rig_t *rig, int timeout_ms) {
 }
 
 static bool serve_moving(rig_t *rig) {
-    bus_start(rig);
+    shared_bus_start(&rig->shared_bus);
     uint64_t reading_ns = (rig->board.time_ns / RIG_READ_STEP_NS + 1) * RIG_READ_STEP_NS;
     advance(rig, earlier(reading_ns, rig->config.stop_at_ns));
     transport_flush(rig->config.transport);

@@ -4,7 +4,7 @@
 
 #include <stdbool.h>
 
-#include "rig/rig.h"
+#include "rig/rig_state.h"
 
 /* No clients; the rest of the rig is initialised. Keeps a pointer to the rig in the transport. */
 void server_init(rig_t *rig);

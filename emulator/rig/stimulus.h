@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#include "rig/rig.h"
+#include "rig/rig_state.h"
 
 /* Fields of RIG_SET_REPLY. */
 typedef struct {

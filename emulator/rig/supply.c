@@ -9,52 +9,56 @@
 #define TWO_PI (2.0 * 3.14159265358979323846)
 #define S_PER_NS 1e-9
 
-static double ripple_V(const rig_t *rig) {
-    const supply_t *supply = &rig->supply;
+static uint64_t now_ns(const supply_t *supply) {
+    return *supply->scheduler->clock_ns;
+}
+
+static double ripple_V(const supply_t *supply) {
     if (supply->ripple_V == 0.0) {
         return 0.0;
     }
-    const uint64_t middle_ns = rig->board.time_ns - supply->ripple_start_ns + SUPPLY_STEP_NS / 2;
+    const uint64_t middle_ns = now_ns(supply) - supply->ripple_start_ns + SUPPLY_STEP_NS / 2;
     const double periods = supply->ripple_Hz * (double)middle_ns * S_PER_NS;
     double sine, cosine;
     magnetics_kernel_sine_cosine(TWO_PI * (periods - floor(periods + 0.5)), &sine, &cosine);
     return supply->ripple_V * sine;
 }
 
-static void apply(rig_t *rig) {
-    const supply_t *supply = &rig->supply;
-    plant_advance(&rig->plant, rig->board.time_ns);
-    plant_set_supply_voltage(&rig->plant, fmax(supply->voltage_V * supply->factor + ripple_V(rig), 0.0));
-    rig->scheduler.due_ns[EVENT_SUPPLY] =
-        supply->ripple_V != 0.0 ? rig->board.time_ns + SUPPLY_STEP_NS : SCHEDULER_NEVER;
+static void apply(supply_t *supply) {
+    plant_advance(supply->plant, now_ns(supply));
+    plant_set_supply_voltage(supply->plant, fmax(supply->voltage_V * supply->factor + ripple_V(supply), 0.0));
+    supply->scheduler->due_ns[EVENT_SUPPLY] =
+        supply->ripple_V != 0.0 ? now_ns(supply) + SUPPLY_STEP_NS : SCHEDULER_NEVER;
 }
 
-void supply_init(rig_t *rig) {
-    rig->supply =
-        (supply_t){.voltage_V = rig->plant.machine->supply_voltage_V, .factor = 1.0, .ripple_Hz = RIPPLE_DEFAULT_HZ};
+void supply_init(supply_t *supply, plant_t *plant, scheduler_t *scheduler) {
+    *supply = (supply_t){.plant = plant,
+                         .scheduler = scheduler,
+                         .voltage_V = plant->machine->supply_voltage_V,
+                         .factor = 1.0,
+                         .ripple_Hz = RIPPLE_DEFAULT_HZ};
 }
 
-void supply_set_voltage(rig_t *rig, double voltage_V) {
-    rig->supply.voltage_V = voltage_V;
-    apply(rig);
+void supply_set_voltage(supply_t *supply, double voltage_V) {
+    supply->voltage_V = voltage_V;
+    apply(supply);
 }
 
-void supply_set_ripple_frequency(rig_t *rig, double frequency_Hz) {
-    rig->supply.ripple_Hz = frequency_Hz;
-    rig->supply.ripple_start_ns = rig->board.time_ns;
-    apply(rig);
+void supply_set_ripple_frequency(supply_t *supply, double frequency_Hz) {
+    supply->ripple_Hz = frequency_Hz;
+    supply->ripple_start_ns = now_ns(supply);
+    apply(supply);
 }
 
-void supply_set_fault(rig_t *rig, double factor, double ripple_V) {
-    if (rig->supply.ripple_V == 0.0) {
-        rig->supply.ripple_start_ns = rig->board.time_ns;
+void supply_set_fault(supply_t *supply, double factor, double ripple_V) {
+    if (supply->ripple_V == 0.0) {
+        supply->ripple_start_ns = now_ns(supply);
     }
-    rig->supply.factor = factor;
-    rig->supply.ripple_V = ripple_V;
-    apply(rig);
+    supply->factor = factor;
+    supply->ripple_V = ripple_V;
+    apply(supply);
 }
 
-void supply_event(void *context, uint64_t now_ns) {
-    (void)now_ns;
-    apply(context);
+void supply_step(supply_t *supply) {
+    apply(supply);
 }

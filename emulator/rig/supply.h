@@ -5,23 +5,33 @@
 
 #include <stdint.h>
 
-#include "rig/rig.h"
+#include "plant/plant.h"
+#include "rig/scheduler.h"
 
 #define SUPPLY_STEP_NS UINT64_C(20000)
 
-/* That of the machine file, without faults. */
-void supply_init(rig_t *rig);
+typedef struct {
+    plant_t *plant;         /* that it supplies */
+    scheduler_t *scheduler; /* with EVENT_SUPPLY */
+    double voltage_V;       /* supply_voltage_V */
+    double factor;          /* of a fault */
+    double ripple_V, ripple_Hz;
+    uint64_t ripple_start_ns;
+} supply_t;
+
+/* The voltage of the machine file, without faults. Keeps plant and scheduler. */
+void supply_init(supply_t *supply, plant_t *plant, scheduler_t *scheduler);
 
 /* supply_voltage_V, from the present time on. */
-void supply_set_voltage(rig_t *rig, double voltage_V);
+void supply_set_voltage(supply_t *supply, double voltage_V);
 
-/* Of the ripple, 300 Hz at the start; its phase is 0 from now on. */
-void supply_set_ripple_frequency(rig_t *rig, double frequency_Hz);
+/* Frequency of the ripple, 300 Hz at the start; its phase is 0 from now on. */
+void supply_set_ripple_frequency(supply_t *supply, double frequency_Hz);
 
 /* A factor of that voltage, and the amplitude of a sine that is added, its phase 0 when it begins. */
-void supply_set_fault(rig_t *rig, double factor, double ripple_V);
+void supply_set_fault(supply_t *supply, double factor, double ripple_V);
 
-/* Handler of EVENT_SUPPLY; context is the rig. */
-void supply_event(void *context, uint64_t now_ns);
+/* EVENT_SUPPLY: the next step of a voltage with ripple. */
+void supply_step(supply_t *supply);
 
 #endif

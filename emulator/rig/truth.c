@@ -3,7 +3,6 @@
 #include <math.h>
 #include <string.h>
 
-#include "rig/heat.h"
 #include "rig_codec.h"
 
 #define RPM_PER_RAD_S (30.0 / 3.14159265358979323846)
@@ -24,8 +23,7 @@ void truth_pack_fault(unsigned kind, unsigned phase, unsigned leg, bool present,
     frame->classic.len = RIG_TRUTH_FAULT_LENGTH;
 }
 
-void truth_pack(const rig_t *rig, transport_frame_t frames[TRUTH_FRAMES]) {
-    const plant_t *plant = &rig->plant;
+void truth_pack(const plant_t *plant, const heat_t *heat, transport_frame_t frames[TRUTH_FRAMES]) {
     struct rig_truth_motion_t motion;
     motion.speed_rpm = rig_truth_motion_speed_rpm_encode(plant->speed_rad_s * RPM_PER_RAD_S);
     motion.torque_nm = rig_truth_motion_torque_nm_encode(plant_torque_Nm(plant));
@@ -46,8 +44,8 @@ void truth_pack(const rig_t *rig, transport_frame_t frames[TRUTH_FRAMES]) {
     rig_truth_bench_set_physical_rotor_angle_deg(&bench, angle_deg < 0.0 ? angle_deg + 360.0 : angle_deg);
     bench.load_torque_nm = rig_truth_bench_load_torque_nm_encode(plant_shaft_torque_Nm(plant));
     bench.bus_voltage_v = rig_truth_bench_bus_voltage_v_encode(plant->bus_voltage_V);
-    rig_truth_bench_set_physical_winding_temperature_c(&bench, heat_winding_C(rig));
-    rig_truth_bench_set_physical_inverter_temperature_c(&bench, heat_inverter_C(rig));
+    rig_truth_bench_set_physical_winding_temperature_c(&bench, heat_winding_C(heat));
+    rig_truth_bench_set_physical_inverter_temperature_c(&bench, heat_inverter_C(heat));
     for (uint8_t part = 0; part < 2; part++) {
         bench.part = part;
         rig_truth_bench_pack(begin(&frames[3 + part], RIG_TRUTH_BENCH_FRAME_ID), &bench, 8);

@@ -57,7 +57,7 @@ TEST_F(Heat, AWindingHasTheHeatOfItsLossesLessWhatItGaveAway) {
     EXPECT_LT(kept_J, loss_J);
     // Given away: at most that of the last temperature all the time, at least none.
     EXPECT_GT(kept_J, loss_J - rise_K / data().winding_resistance_K_W * 0.5);
-    EXPECT_NEAR(heat_winding_C(bench.rig.get()), 25.0 + rise_K, 1e-12);
+    EXPECT_NEAR(heat_winding_C(&bench.rig->heat), 25.0 + rise_K, 1e-12);
     EXPECT_NEAR(heat().winding.temperature_C[2], 25.0, 1e-3);
 }
 
@@ -83,8 +83,8 @@ TEST_F(Heat, CoolsWithItsTimeConstantToTheAmbientTemperature) {
     set(HELD_INVERTER, 80.0);
     set(AMBIENT, 5.0);
     run_to(2 * MS);
-    EXPECT_EQ(heat_winding_C(bench.rig.get()), 125.0);
-    EXPECT_EQ(heat_inverter_C(bench.rig.get()), 80.0);
+    EXPECT_EQ(heat_winding_C(&bench.rig->heat), 125.0);
+    EXPECT_EQ(heat_inverter_C(&bench.rig->heat), 80.0);
     set(HELD_WINDING, NAN);
     set(HELD_INVERTER, NAN);
     const double from_s = heat().time_ns * 1e-9;

@@ -178,7 +178,7 @@ class RigBench {
         do {
             before_ns = rig->board.time_ns;
             ASSERT_TRUE(rig_serve(rig.get(), 0));
-        } while (rig->board.time_ns != before_ns || rig->run_count > 0);
+        } while (rig->board.time_ns != before_ns || rig->server.run_count > 0);
     }
 
     std::vector<BusRecord> run_to(BusClient &client, uint64_t time_ns) {
