@@ -9,6 +9,7 @@
 #include <string.h>
 
 #include "hal_adc.h"
+#include "plant/units.h"
 #include "rig/can_bus.h"
 
 static_assert(OPTIONS_ADC_BITS_MIN == HAL_ADC_BITS_MIN && OPTIONS_ADC_BITS_MAX == HAL_ADC_BITS_MAX,
@@ -17,8 +18,6 @@ static_assert(OPTIONS_BIT_RATE_MIN == CAN_BUS_BIT_RATE_MIN && OPTIONS_BIT_RATE_M
               "the record and the emulated bus disagree on bit rates");
 static_assert(OPTIONS_DRIVES_MAX == CAN_BUS_DRIVES_MAX && OPTIONS_NODE_MAX == CAN_BUS_DRIVES_MAX - 1,
               "the record and the emulated bus disagree on the number of drives");
-
-#define RAD_PER_DEG (3.14159265358979323846 / 180.0)
 
 /* Return values of getopt_long: numbers of options from 1, because getopt_long returns 0 for another purpose. */
 enum { HELP = OPTION_COUNT + 1 };

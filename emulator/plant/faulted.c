@@ -2,8 +2,6 @@
 
 #include <math.h>
 
-/* As in plant.c: below this a current that decays exponentially counts as zero. */
-
 /* Devices that carry the current of one end of a winding. */
 typedef struct {
     bool rail; /* the end is where a switch that is on would put it */
@@ -27,15 +25,6 @@ static end_t end_of(const plant_t *plant, bool on, bool diode_open) {
 
 static bool bit(unsigned mask, unsigned phase) {
     return (mask >> phase) & 1u;
-}
-
-/* Flux rate of a phase, at which a current of its turns and of its terminals follow. */
-static double flux_rate_V(const plant_path_t *path, double bus_voltage_V, double current_A) {
-    return path->link_gain * bus_voltage_V - path->drop_V - path->resistance_ohm * current_A;
-}
-
-static double terminal_A(const plant_path_t *path, double bus_voltage_V, double current_A) {
-    return path->terminal_gain * current_A + path->terminal_S * flux_rate_V(path, bus_voltage_V, current_A);
 }
 
 /* Path of a phase while current flows at its terminals. */
@@ -93,7 +82,8 @@ void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
             continue;
         }
         setting->path[count] = path;
-        setting->isolated[count] = shorted && !driven && terminal_A(&path, plant->bus_voltage_V, current_A) <= 0.0;
+        setting->isolated[count] =
+            shorted && !driven && plant_path_terminal_A(&path, plant->bus_voltage_V, current_A) <= 0.0;
         if (setting->isolated[count]) {
             path = isolated_path(plant, phase);
         }
@@ -143,7 +133,8 @@ double faulted_distance_to_event(const integrator_setting_t *setting, const inte
     }
     for (unsigned index = 0; index < setting->count; index++) {
         if (setting->turns[index] > 0.0) {
-            const double at_A = terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
+            const double at_A =
+                plant_path_terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
             nearest = fmin(nearest, setting->isolated[index] ? -at_A : at_A);
         }
     }
@@ -154,7 +145,8 @@ double faulted_distance_to_trip(const integrator_setting_t *setting, const integ
     double nearest_A = INFINITY;
     for (unsigned index = 0; index < setting->count; index++) {
         if (setting->terminal_sign[index] >= 0.0 && !setting->isolated[index]) {
-            const double at_A = terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
+            const double at_A =
+                plant_path_terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
             nearest_A = fmin(nearest_A, setting->trip_current_A - at_A);
         }
     }
@@ -214,12 +206,4 @@ double faulted_time_constant_s(const plant_t *plant) {
         }
     }
     return time_constant_s;
-}
-
-double plant_current_A(const plant_t *plant, unsigned phase) {
-    const double current_A = plant->current_A[phase];
-    if (!plant->faulted || plant->faults.shorted_turns[phase] == 0.0) {
-        return current_A;
-    }
-    return fmax(terminal_A(&plant->path[phase], plant->bus_voltage_V, current_A), 0.0);
 }

@@ -29,11 +29,11 @@
 #define PLANT_FAULTED_H
 
 #include "plant/integrator.h"
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 
 #define FAULTED_BREAKDOWN 2.0 /* of an avalanche and of an arc, in supply voltages of the machine file */
 
-/* As plant.c's own for a healthy plant: lists the conducting phases and their devices. */
+/* Lists the conducting phases and their devices. */
 void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting);
 
 /* Adds the friction of the shaft to a setting whose other members are known. */

@@ -16,7 +16,7 @@
 #include "hal.h"
 #include "plant/machine.h"
 #include "plant/magnetics.h"
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 
 /* Constants of a step. Arrays are indexed by conducting phase, 0..count - 1. */
 typedef struct {

@@ -61,7 +61,7 @@ static void decide(link_t *link) {
     } else if (chopper) {
         link->rising_V = link->rising_V < machine->chopper_on_V ? link->rising_V : machine->chopper_on_V;
     }
-    link->longest_s = link->plant->step_factor * STEP_TIME_CONSTANTS / (link->conductance_S * -link->charge_1_F);
+    link->longest_s = link->plant->limits.factor * STEP_TIME_CONSTANTS / (link->conductance_S * -link->charge_1_F);
     link->step_max_s = link->record == NULL ? link->longest_s : 0.0;
 }
 

@@ -16,7 +16,7 @@
 
 #include <stdbool.h>
 
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 
 #define LINK_STEPS_MAX 256
 

@@ -5,8 +5,7 @@
 
 #include "plant/exponential.h"
 #include "plant/magnetics_kernel.h"
-
-#define PI 3.14159265358979323846
+#include "plant/units.h"
 
 void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles) {
     memset(model, 0, sizeof *model);

@@ -3,6 +3,9 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/plant_switches.h"
+#include "plant/units.h"
+
 /* State of a phase within a step: its current, and its torque's impulse since the start. */
 static void phase_within(const phase_record_t *record, double at_s, double *current_A, double *impulse_Nms) {
     *current_A = *impulse_Nms = 0.0;
@@ -19,8 +22,8 @@ void phase_samples_take(plant_t *plant, const rotor_step_t *rotor, double correc
     const uint64_t start_ns = plant->time_ns;
     double current_A[HAL_PHASES_MAX];
     memcpy(current_A, plant->current_A, sizeof current_A);
-    while (plant->sample_next_ns < end_ns) {
-        const double at_s = (double)(plant->sample_next_ns - start_ns) * NS_S, x = at_s / rotor->length_s;
+    while (plant->observation.next_ns < end_ns) {
+        const double at_s = (double)(plant->observation.next_ns - start_ns) * S_PER_NS, x = at_s / rotor->length_s;
         double net_Nms = -plant->load_torque_Nm * at_s;
         for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
             double impulse_Nms;
@@ -36,10 +39,9 @@ void phase_samples_take(plant_t *plant, const rotor_step_t *rotor, double correc
         if (link->count > 0) {
             plant->bus_voltage_V = link_recorded_V(link, at_s);
         }
-        plant->time_ns = plant->sample_next_ns;
+        plant->time_ns = plant->observation.next_ns;
         plant_follow_edges(plant, end_ns);
-        plant->sample_next_ns += plant->sample_step_ns;
-        plant->sample(plant->sample_context, plant);
+        plant_take_sample(plant);
     }
     plant->time_ns = start_ns;
     memcpy(plant->current_A, current_A, sizeof current_A);

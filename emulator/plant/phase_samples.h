@@ -6,9 +6,10 @@
 
 #include "plant/hermite.h"
 #include "plant/link_steps.h"
-#include "plant/phase_steps.h"
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 #include "plant/rotor_step.h"
+
+#define PHASE_STEPS_MAX 64 /* of a phase in a step of the rotor */
 
 /* A step of a phase. */
 typedef struct {

@@ -10,16 +10,13 @@
 #include "plant/phase_samples.h"
 #include "plant/phase_walk.h"
 #include "plant/rotor_step.h"
+#include "plant/units.h"
 
 /* Limit at factor 1 of the feedback from the torque through the angle to the currents, which a step neglects but for
  * the correction at its end: (d psi / d theta)^2 h^2 / (L J). */
 #define COUPLING_MAX 3e-5
 /* Change of a current in a step, in limits of the common steps of all phases: 0.15 of saturation_A at factor 1. */
 #define CURRENT_STEPS (0.15 / 0.09)
-
-static bool has_link(const plant_t *plant) {
-    return plant->machine->dc_link.capacitance_F > 0.0;
-}
 
 static inline bool conducts(const rotor_step_t *rotor, double current_A, unsigned on) {
     return current_A >= PLANT_CURRENT_NEGLIGIBLE_A || (on == 2 && rotor->driven);
@@ -110,7 +107,7 @@ MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_st
     }
     rotor->driven = rotor->voltage_V[2] > 0.0;
     rotor->trip_current_A = plant->tripped ? INFINITY : plant->trip_current_A;
-    rotor->current_step_A = CURRENT_STEPS * plant->step_current_A;
+    rotor->current_step_A = CURRENT_STEPS * plant->limits.current_A;
     rotor->angle_rad = angle_rad;
     rotor->speed_rad_s = speed_rad_s;
     rotor->start_ns = (uint32_t)(plant->time_ns - plant->pattern_ns);
@@ -152,21 +149,21 @@ MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_st
     rotor->half_rad_s2 = 0.5 * rotor->acceleration_rad_s2;
     rotor->half_rad_s3 = 0.5 * rotor->jerk_rad_s3;
 
-    double limit_s = plant->step_max_s;
-    if (fabs(speed_rad_s) * limit_s > plant->step_angle_rad) {
-        limit_s = plant->step_angle_rad / fabs(speed_rad_s);
+    double limit_s = plant->limits.own_max_s;
+    if (fabs(speed_rad_s) * limit_s > plant->limits.angle_rad) {
+        limit_s = plant->limits.angle_rad / fabs(speed_rad_s);
     }
-    const double coupling_max = plant->step_factor * plant->step_factor * COUPLING_MAX;
+    const double coupling_max = plant->limits.factor * plant->limits.factor * COUPLING_MAX;
     if (coupling_1_s2 * limit_s * limit_s > coupling_max) {
         limit_s = sqrt(coupling_max / coupling_1_s2);
     }
     uint64_t length_ns = to_ns - plant->time_ns;
-    if ((double)length_ns * NS_S > limit_s) {
-        const uint64_t steps = (uint64_t)ceil((double)length_ns * NS_S / limit_s);
+    if ((double)length_ns * S_PER_NS > limit_s) {
+        const uint64_t steps = (uint64_t)ceil((double)length_ns * S_PER_NS / limit_s);
         length_ns = (length_ns + steps - 1) / steps;
     }
     rotor->length_ns = length_ns;
-    rotor->length_s = (double)length_ns * NS_S;
+    rotor->length_s = (double)length_ns * S_PER_NS;
     /* A generous bound: beyond it a phase takes a corner's place for its own. */
     const double reach_rad =
         1.1 * rotor->length_s * (fabs(speed_rad_s) + 2.0 * fabs(rotor->acceleration_rad_s2) * rotor->length_s);
@@ -239,7 +236,7 @@ MAGNETICS_INLINE void correct(plant_phase_t *state, double end_rad, double corre
 
 void phase_steps_reset(plant_t *plant) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        plant->phase[phase] = (plant_phase_t){.smooth_from_rad = INFINITY, .smooth_to_rad = -INFINITY};
+        plant->phase[phase] = (plant_phase_t){.smooth = SMOOTH_RANGE_EMPTY};
     }
 }
 
@@ -249,7 +246,7 @@ MAGNETICS_INLINE bool advance_of(plant_t *plant, magnetics_form_t form, bool lin
     rotor_step_t rotor;
     start_step(plant, form, &rotor, to_ns);
     const uint64_t end_ns = plant->time_ns + rotor.length_ns;
-    const bool sampled = plant->sample != NULL && plant->sample_next_ns < end_ns;
+    const bool sampled = plant->observation.sample != NULL && plant->observation.next_ns < end_ns;
     if (sampled) {
         for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
             records[phase].count = 0;
@@ -324,5 +321,5 @@ bool phase_steps_advance(plant_t *plant, uint64_t to_ns) {
     if (plant->faulted || plant->trip_ns != UINT64_MAX) {
         return false;
     }
-    return has_link(plant) ? advance_with_link(plant, to_ns) : advance_without_link(plant, to_ns);
+    return plant_has_link(plant) ? advance_with_link(plant, to_ns) : advance_without_link(plant, to_ns);
 }

@@ -24,16 +24,14 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 
 /* Advances by one step of the rotor, to `to_ns` at most, and takes the samples within. False, and nothing changed,
  * where it does not apply: with faults, a comparator that responds, or when a phase has more
- * than PHASE_STEPS_MAX steps. */
+ * than PHASE_STEPS_MAX steps (phase_samples.h). */
 bool phase_steps_advance(plant_t *plant, uint64_t to_ns);
 
 /* Discards what is kept of the magnetics' last evaluations; after a change of the machine. */
 void phase_steps_reset(plant_t *plant);
-
-#define PHASE_STEPS_MAX 64
 
 #endif

@@ -12,9 +12,10 @@
 #include "plant/link_steps.h"
 #include "plant/magnetics_kernel.h"
 #include "plant/phase_samples.h"
-#include "plant/phase_steps.h"
-#include "plant/plant.h"
+#include "plant/plant_state.h"
 #include "plant/rotor_step.h"
+#include "plant/smooth_range.h"
+#include "plant/units.h"
 
 /* Shortest last step before a current ends. */
 #define STEP_MIN_S 1e-13
@@ -38,20 +39,16 @@ static inline double lesser(double a, double b) {
 /* Shortens a step so that it ends where the phase's magnetics are not smooth; true if it does. */
 static bool end_at_corner(const plant_t *plant, unsigned phase, const rotor_step_t *rotor, plant_phase_t *state,
                           double at_s, double angle_rad, double speed_rad_s, double *step_s) {
-    if (angle_rad < state->smooth_from_rad + MAGNETICS_SMOOTH_TOLERANCE_RAD ||
-        angle_rad > state->smooth_to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD) {
+    if (!smooth_range_has(&state->smooth, angle_rad)) {
         const double phase_rad = angle_rad - phase * plant->phase_offset_rad;
-        state->smooth_to_rad = angle_rad + magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, 1.0);
-        state->smooth_from_rad = angle_rad - magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, -1.0);
+        state->smooth.to_rad = angle_rad + magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, 1.0);
+        state->smooth.from_rad = angle_rad - magnetics_smooth_distance_rad(&plant->magnetics, phase_rad, -1.0);
     }
-    const bool forward = speed_rad_s > 0.0 || (speed_rad_s == 0.0 && rotor->acceleration_rad_s2 > 0.0);
-    const double corner_rad = forward ? state->smooth_to_rad : state->smooth_from_rad;
-    const double distance_rad = fabs(corner_rad - angle_rad), along_rad_s = fabs(speed_rad_s);
-    const double along_rad_s2 = forward ? rotor->acceleration_rad_s2 : -rotor->acceleration_rad_s2;
-    if (*step_s * (along_rad_s + 0.5 * along_rad_s2 * *step_s) <= distance_rad) {
+    const double acceleration_rad_s2 = rotor->acceleration_rad_s2;
+    const double corner_rad = smooth_range_ahead_rad(&state->smooth, speed_rad_s, acceleration_rad_s2);
+    if (!smooth_range_shorten(angle_rad, speed_rad_s, acceleration_rad_s2, corner_rad, step_s)) {
         return false;
     }
-    *step_s = 2.0 * distance_rad / (along_rad_s + sqrt(along_rad_s * along_rad_s + 2.0 * along_rad_s2 * distance_rad));
     /* The jerk's part of the angle. */
     double end_rad, end_rad_s;
     rotor_at(rotor, at_s + *step_s, &end_rad, &end_rad_s);
@@ -113,8 +110,8 @@ MAGNETICS_INLINE void walk_start(plant_t *plant, magnetics_form_t form, unsigned
     walk->kept = kept;
     walk->offset_rad = phase * plant->phase_offset_rad;
     walk->corners = (form == MAGNETICS_SATURATING || form == MAGNETICS_LINEAR_TRAPEZOID) &&
-                    !(rotor->least_rad > kept->smooth_from_rad + MAGNETICS_SMOOTH_TOLERANCE_RAD &&
-                      rotor->most_rad < kept->smooth_to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD);
+                    !(rotor->least_rad > kept->smooth.from_rad + MAGNETICS_SMOOTH_TOLERANCE_RAD &&
+                      rotor->most_rad < kept->smooth.to_rad - MAGNETICS_SMOOTH_TOLERANCE_RAD);
     walk->known = kept->known;
     walk->switches = plant->switches[phase];
     walk->on = half_bridge_on(walk->switches);
@@ -137,7 +134,7 @@ MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, un
     const double at_s = walk->end_s;
     double until_s = rotor->length_s;
     for (; walk->edge < pattern->count; walk->edge++) {
-        const double edge_s = (double)(int32_t)(pattern->delay_ns[walk->edge] - rotor->start_ns) * NS_S;
+        const double edge_s = (double)(int32_t)(pattern->delay_ns[walk->edge] - rotor->start_ns) * S_PER_NS;
         if (edge_s > at_s) {
             until_s = lesser(until_s, edge_s);
             break;
@@ -175,10 +172,10 @@ MAGNETICS_INLINE bool walk_begin(const plant_t *plant, magnetics_form_t form, un
     double step_s = until_s - at_s;
     const double change_A = fabs(current_A_s) * step_s;
     const double swing_s2_H = tied ? step_s * step_s * walk->inverse_1_H : 0.0;
-    if (change_A > rotor->current_step_A || (tied && swing_s2_H > plant->link_swing_s2_H)) {
+    if (change_A > rotor->current_step_A || (tied && swing_s2_H > plant->limits.link_swing_s2_H)) {
         double steps = change_A / rotor->current_step_A;
-        if (tied && swing_s2_H > steps * steps * plant->link_swing_s2_H) {
-            steps = sqrt(swing_s2_H / plant->link_swing_s2_H);
+        if (tied && swing_s2_H > steps * steps * plant->limits.link_swing_s2_H) {
+            steps = sqrt(swing_s2_H / plant->limits.link_swing_s2_H);
         }
         step_s /= ceil(steps);
         walk->end_s = at_s + step_s;

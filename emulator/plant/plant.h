@@ -23,7 +23,7 @@
  * equations as faulted.h states.
  *
  * Integration: phase_steps.h, where every phase has steps of its own; with faults, and where a
- * comparator responds, integrator.h, for currents, speed, angle and DC-link voltage together. Steps end at switching
+ * comparator responds, common_steps.h, for currents, speed, angle and DC-link voltage together. Steps end at switching
  * edges (whole nanoseconds), at the times at which a diode, the supply or the chopper starts or stops conducting or a
  * comparator responds (located within a picosecond) and where the magnetics are not smooth; plant_set_step_factor
  * scales the other limits of their length.
@@ -31,130 +31,11 @@
 #ifndef PLANT_PLANT_H
 #define PLANT_PLANT_H
 
-#include <stdbool.h>
 #include <stdint.h>
 
-#include "hal.h"
-#include "hal_pwm.h"
-#include "plant/half_bridge.h"
 #include "plant/machine.h"
-#include "plant/magnetics.h"
-
-/* Response of comparator, filter and gate driver. */
-#define PLANT_TRIP_RESPONSE_NS 1000
-
-/* A freewheeling current decays exponentially; below this it counts as zero. */
-#define PLANT_CURRENT_NEGLIGIBLE_A 1e-9
-
-/* Temperature of the winding that the resistance of a machine file is for. */
-#define PLANT_RESISTANCE_C 25.0
-
-struct plant;
-typedef void (*plant_sample_t)(void *context, const struct plant *plant);
-
-/* Factors on the values of the machine file. */
-typedef struct {
-    double flux_linkage; /* > 0: flux linkage and torque of every phase at the same angle and current */
-    double resistance;   /* > 0: windings, at any temperature */
-    double inertia;      /* > 0 */
-    double friction;     /* >= 0 */
-} plant_gains_t;
-
-/* Faults of converter, machine and shaft; all zero: none. The equations are in faulted.h. Bit j is phase j. */
-typedef struct {
-    uint8_t winding_open;
-    half_bridge_switches_t switch_open, switch_shorted; /* a shorted switch conducts even when it is open as well */
-    half_bridge_switches_t diode_open; /* upper: to the positive rail, from the winding's lower end; lower: from the
-                                          negative rail to its upper end */
-    bool chopper_open;
-    double shorted_turns[HAL_PHASES_MAX]; /* fraction of the turns of a phase, 0..0.5 */
-    double coulomb_Nm, static_Nm;         /* friction torques, >= 0 */
-    double earth_ohm[HAL_PHASES_MAX];     /* of the lower end of a winding to the negative rail; 0: none */
-} plant_faults_t;
-
-/* How a phase of a plant with faults carries its current: a row of the equations in faulted.h. */
-typedef struct {
-    double link_gain, drop_V, resistance_ohm;       /* of the flux rate: q s, q V, q (R + r / (1 - k)) */
-    double terminal_gain, terminal_S;               /* of the terminals' current: by i_m, by the flux rate */
-    double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown, that of arc and avalanche */
-} plant_path_t;
-
-/* What phase_steps.h keeps of a phase from step to step. */
-typedef struct {
-    bool known; /* the magnetics at this current and angle are in `point` */
-    double current_A, angle_rad;
-    double flux_Wb, inverse_1_H; /* flux linkage; inverse of the incremental inductance */
-    magnetics_point_t point;
-    double smooth_from_rad, smooth_to_rad; /* angles of the rotor between which its magnetics are smooth */
-} plant_phase_t;
-
-typedef struct plant {
-    /* State at time_ns; read only. */
-    uint64_t time_ns;
-    double speed_rad_s;
-    double rotor_angle_rad;           /* unwrapped */
-    double current_A[HAL_PHASES_MAX]; /* with shorted turns: plant_current_A */
-    double bus_voltage_V;
-    uint8_t switches[HAL_PHASES_MAX]; /* that are on: HALF_BRIDGE_UPPER, HALF_BRIDGE_LOWER */
-    bool chopper_on;
-    bool tripped; /* the comparators have opened the switches since plant_clear_trip */
-
-    /* Inputs; write at any time. The load torque acts from time_ns, the minimum pulse from the next plant_set_switches.
-     */
-    double load_torque_Nm;
-    double minimum_pulse_ns;
-
-    plant_gains_t gains;   /* read only; plant_set_gains changes them */
-    plant_faults_t faults; /* read only; plant_set_faults changes them */
-
-    /* Energies since plant_init. Energy balance at every instant:
-     * drawn - returned = copper + converter + load + friction + fault
-     *                    + change of plant_field_energy_J + change of plant_kinetic_energy_J
-     * supplied = source + chopper + drawn - returned + change of plant_link_energy_J (with a capacitor)
-     */
-    double energy_drawn_J;     /* from the link, both switches on */
-    double energy_returned_J;  /* to the link, both switches off */
-    double energy_copper_J;    /* in the windings */
-    double energy_converter_J; /* in the half bridges' devices */
-    double energy_load_J;      /* work done on the load and the dynamometer */
-    double energy_friction_J;
-    double energy_fault_J;    /* in arcs and avalanches, and in a shaft that is locked */
-    double energy_supplied_J; /* by the source; this and the next two with a capacitor only */
-    double energy_source_J;   /* in the source's resistance */
-    double energy_chopper_J;
-    double phase_copper_J[HAL_PHASES_MAX], phase_converter_J[HAL_PHASES_MAX]; /* parts of energy_copper_J and
-                                                                                 energy_converter_J */
-
-    /* Private to plant.c and the steps of the phases (phase_steps.h). */
-    const machine_t *machine;
-    magnetics_model_t magnetics;
-    double winding_gain[HAL_PHASES_MAX], winding_ohm[HAL_PHASES_MAX]; /* gain: by temperature */
-    double inertia_kg_m2, friction_Nm_s;
-    double phase_offset_rad;
-    double drop_V[3];                         /* of the devices, by the number of switches that are on */
-    double resistance_ohm[HAL_PHASES_MAX][3]; /* of winding and devices, likewise */
-    double step_factor, step_max_s, together_step_max_s, step_current_A, step_angle_rad;
-    double link_swing_s2_H; /* limit of a step of a phase on a DC link: its square by the incremental inductance */
-    double smooth_from_rad, smooth_to_rad;
-    double supply_voltage_V;
-    bool held; /* plant_hold */
-    double held_acceleration_rad_s2;
-    bool faulted; /* any of `faults` */
-    plant_path_t path[HAL_PHASES_MAX];
-    half_bridge_pattern_t pattern[HAL_PHASES_MAX]; /* of the control period that began at pattern_ns */
-    uint64_t pattern_ns;
-    hal_pwm_compare_t pattern_compare; /* of which `pattern` is; with a period of 0 ticks: none */
-    uint16_t pattern_period_ticks;
-    double pattern_minimum_pulse_ns;
-    uint32_t shortest_ticks; /* of that pulse */
-    uint8_t edge_next[HAL_PHASES_MAX];
-    plant_phase_t phase[HAL_PHASES_MAX];
-    double trip_current_A; /* plant_set_trip */
-    uint64_t trip_ns;      /* time at which the switches open, after a comparator's response; UINT64_MAX: none */
-    plant_sample_t sample;
-    void *sample_context;
-    uint64_t sample_next_ns, sample_step_ns;
-} plant_t;
+#include "plant/plant_state.h"
+#include "plant/plant_switches.h"
 
 /* Initialises a machine at rest at time 0: no current, all switches open, DC link at the supply voltage, no load.
  * `machine` must outlive the plant. */
@@ -185,16 +66,6 @@ void plant_set_winding_temperatures(plant_t *plant, const double temperature_C[H
 /* Changes the faults from time_ns on. Currents (with shorted turns: magnetomotive forces) continue unchanged. */
 void plant_set_faults(plant_t *plant, const plant_faults_t *faults);
 
-/* Starts a control period at time_ns: the switches follow `compare` (half_bridge.h) for 2 * period_ticks timer ticks
- * and then keep their states until the next call. period_ticks > 0. */
-void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks);
-
-/* Switches follow the edges up to time_ns; returns the time of the next one, at most to_ns. */
-uint64_t plant_follow_edges(plant_t *plant, uint64_t to_ns);
-
-/* Opens all switches at time_ns and discards the pending edges. */
-void plant_open_all(plant_t *plant);
-
 /* Comparators of the gate drivers, from time_ns on: all switches open PLANT_TRIP_RESPONSE_NS after the current of a
  * phase with a conducting switch exceeds trip_current_A, and `tripped` is set; plant_set_switches can close them again.
  * INFINITY, after plant_init: none. */
@@ -216,27 +87,5 @@ void plant_observe(plant_t *plant, uint64_t first_ns, uint64_t step_ns, plant_sa
 
 /* Scales all limits of the step length. factor > 0: 1 (default) gives the accuracy stated in plant.c, less is finer. */
 void plant_set_step_factor(plant_t *plant, double factor);
-
-/* Current at the terminals of a phase. */
-double plant_current_A(const plant_t *plant, unsigned phase);
-
-/* Electromagnetic torque, sum of all phases. */
-double plant_torque_Nm(const plant_t *plant);
-
-/* Torque that the shaft takes, as a torque transducer on it shows: that of the load and of a dynamometer. */
-double plant_shaft_torque_Nm(const plant_t *plant);
-
-/* Mechanical angle relative to the aligned position of a phase (0 and every pole pitch), not wrapped. */
-double plant_phase_angle_rad(const plant_t *plant, unsigned phase);
-
-/* Flux linkage of one phase. */
-double plant_flux_linkage_Wb(const plant_t *plant, unsigned phase);
-
-/* Magnetic energy stored in all phases, and kinetic energy of the rotor. */
-double plant_field_energy_J(const plant_t *plant);
-double plant_kinetic_energy_J(const plant_t *plant);
-
-/* Energy stored in the DC-link capacitor; 0 without one. */
-double plant_link_energy_J(const plant_t *plant);
 
 #endif

@@ -6,9 +6,9 @@
 #include <stdarg.h>
 #include <string.h>
 
+#include "plant/units.h"
+
 #define PREAMBLE_BYTES 10
-#define DEGREES_PER_RAD 57.29577951308232
-#define RPM_PER_RAD_S 9.549296585513721
 
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "rows are written in native byte order, which must be little endian as in the header"
@@ -94,9 +94,9 @@ static void flush(recorder_t *recorder) {
 void recorder_sample(void *context, const plant_t *plant) {
     recorder_t *recorder = context;
     row_t row;
-    const double angle_deg = plant->rotor_angle_rad * DEGREES_PER_RAD;
+    const double angle_deg = plant->rotor_angle_rad * DEG_PER_RAD;
     const float wrapped_deg = (float)(angle_deg - 360.0 * floor(angle_deg / 360.0));
-    row.time_s = (double)plant->time_ns * 1e-9;
+    row.time_s = (double)plant->time_ns * S_PER_NS;
     row.values[0] = (float)(plant->speed_rad_s * RPM_PER_RAD_S);
     row.values[1] = (float)plant_torque_Nm(plant);
     row.values[2] = (float)plant_shaft_torque_Nm(plant);

@@ -5,8 +5,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#define NS_S 1e-9
-
 typedef struct {
     double angle_rad, speed_rad_s, acceleration_rad_s2, jerk_rad_s3; /* at its start */
     double half_rad_s2, half_rad_s3;                                 /* half of the last two */

@@ -2,10 +2,8 @@
 
 #include <math.h>
 
+#include "plant/units.h"
 #include "rig_codec.h"
-
-#define RAD_S_PER_RPM (3.14159265358979323846 / 30.0)
-#define S_PER_NS 1e-9
 
 static bool is_free(double speed_rpm) {
     return speed_rpm == rig_set_held_speed_rpm_decode(RIG_SET_HELD_SPEED_RPM_FREE_CHOICE);

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "fault_kinds.h"
+#include "plant/units.h"
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
@@ -11,7 +12,6 @@
 #include "rig/truth.h"
 #include "rig_codec.h"
 
-#define NS_PER_US UINT64_C(1000)
 #define PERCENT 0.01
 
 _Static_assert(FAULT_COUNT <= FAULT_KINDS_MAX, "room for every kind");

@@ -3,13 +3,13 @@
 #include <math.h>
 
 #include "hal_adc.h"
+#include "plant/units.h"
 #include "rig_codec.h"
 
 #define AMBIENT_C 25.0
 /* Change of a winding's temperature that its resistance follows. */
 #define FOLLOWED_K 1.0
 #define STEP_NS UINT64_C(1000000)
-#define S_PER_NS 1e-9
 #define CODES 65536.0
 #define CODE_12_BITS 0xFFF0u
 

@@ -4,10 +4,9 @@
 
 /* For a sine with the same bits on any computer. */
 #include "plant/magnetics_kernel.h"
+#include "plant/units.h"
 
 #define FREQUENCY_DEFAULT_HZ 1.0 /* GenSigStartValue of load_sine_frequency_Hz */
-#define TWO_PI (2.0 * 3.14159265358979323846)
-#define S_PER_NS 1e-9
 
 static uint64_t now_ns(const load_t *load) {
     return *load->scheduler->clock_ns;

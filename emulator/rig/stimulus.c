@@ -1,13 +1,12 @@
 #include "rig/stimulus.h"
 
 #include "bench_variables.h"
+#include "plant/units.h"
 #include "rig/control_period.h"
 #include "rig/dynamometer.h"
 #include "rig/load.h"
 #include "rig/supply.h"
 #include "rig_codec.h"
-
-#define NS_PER_US UINT64_C(1000)
 
 static void set_encoder_fault(rig_t *rig, double fault) {
     rig->sensors.encoder_fault = (sensors_encoder_fault_t)fault;

@@ -3,10 +3,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/units.h"
 #include "rig_codec.h"
-
-#define RPM_PER_RAD_S (30.0 / 3.14159265358979323846)
-#define DEG_PER_RAD (180.0 / 3.14159265358979323846)
 
 static uint8_t *begin(transport_frame_t *frame, canid_t identifier) {
     memset(frame, 0, sizeof *frame);
