@@ -1,7 +1,7 @@
-"""Includes of C and imports of Python point from higher layers to lower ones, without cycles.
+"""Includes and calls of C and imports of Python point from higher layers to lower ones, without cycles.
 
 Layers are listed from the lowest to the highest; a file belongs to the longest entry that is a prefix of its
-path or module name. Lazy imports and those under TYPE_CHECKING count.
+path or module name. Lazy imports and those under TYPE_CHECKING count, and so does a function's address.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
 JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h",
                                "emulator/qemu/image/main.c"}
 
+CIRCLES_TO_BE_SPLIT = "emulator/campaign/oracle"
+"""Modules that may still call each other in a circle."""
+
 PYTHON_LAYERS = (
     "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",
     "salient.dbc", "salient.toml_file",
@@ -51,6 +54,58 @@ def includes(root: Path) -> Graph:
         places = ({str(Path(file).parent / name), *(str(Path(top) / name) for top in INCLUDE_ROOTS)} for name in names)
         graph[file] = set().union(*(place & files for place in places))
     return graph
+
+
+FUNCTION = re.compile(r"^(?!static\b|MAGNETICS_INLINE\b|typedef\b|return\b|else\b)[A-Za-z_][\w *]*?[ *]"
+                      r"(?P<name>\w+)\([^;{}]*?\)\s*(?P<end>[{;])", re.MULTILINE)
+"""Definition or declaration of a function that other files can call, in sources as clang-format leaves them."""
+NOT_CODE = re.compile(r'/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|^\s*#\s*include[^\n]*', re.DOTALL | re.MULTILINE)
+
+
+def reachable(graph: Graph, start: str) -> set[str]:
+    """A file and all that it includes."""
+    found, waiting = {start}, [start]
+    while waiting:
+        new = graph[waiting.pop()] - found
+        found |= new
+        waiting += new
+    return found
+
+
+def calls(root: Path) -> Graph:
+    """Files of the C layers, each with the files that define the functions it calls or takes the address of.
+
+    A function of the HAL, and one that several ports define, belongs to the header that declares it. A name counts
+    where a header that declares it is included.
+    """
+    included = includes(root)
+    code = {file: NOT_CODE.sub(" ", (root / file).read_text(encoding="utf-8")) for file in included}
+    defined: dict[str, set[str]] = {}
+    declared: dict[str, set[str]] = {}
+    for file, text in code.items():
+        for match in FUNCTION.finditer(text):
+            (defined if match["end"] == "{" else declared).setdefault(match["name"], set()).add(file)
+    graph: dict[str, set[str]] = {}
+    for file, text in code.items():
+        visible = reachable(included, file)
+        names = set(re.findall(r"(?<![\w.>])[a-z]\w*", text)) & set(defined)
+        graph[file] = set()
+        for name in names:
+            headers = declared.get(name, set())
+            port = len(defined[name]) > 1 or any(header.startswith("hal/") for header in headers)
+            if file not in defined[name] and headers & visible:
+                graph[file] |= headers if port else defined[name]
+        graph[file] -= {file}
+    return graph
+
+
+def modules(graph: Graph) -> Graph:
+    """A source file and its header as one."""
+    joined: dict[str, set[str]] = {}
+    for file, targets in graph.items():
+        module = str(Path(file).with_suffix(""))
+        joined.setdefault(module, set()).update(str(Path(target).with_suffix("")) for target in targets)
+    return {module: targets - {module} for module, targets in joined.items()}
 
 
 def imports(package: Path) -> Graph:
@@ -112,6 +167,23 @@ def test_includes_follow_the_layers() -> None:
     assert circle(graph) == []
 
 
+def test_calls_follow_the_layers() -> None:
+    graph = calls(ROOT)
+    assert "emulator/rig/scheduler.c" in graph["emulator/rig/server.c"], "a call"
+    assert "emulator/rig/stimulus.c" in graph["emulator/rig/rig.c"], "an address"
+    assert "emulator/rig/can_bus.c" in graph["emulator/rig/shared_bus.h"], "a call from a header"
+    assert "hal/hal_pwm.h" in graph["firmware/drive.c"], "a port's function"
+    assert list(upwards(graph, C_LAYERS, "/")) == []
+
+
+def test_no_modules_call_each_other_in_a_circle() -> None:
+    graph = modules(calls(ROOT))
+    split = {module: {target for target in targets if not target.startswith(CIRCLES_TO_BE_SPLIT)}
+             for module, targets in graph.items()}
+    assert circle(split) == []
+    assert circle(graph) != [], f"{CIRCLES_TO_BE_SPLIT}: an exception that is not needed"
+
+
 def test_imports_follow_the_layers() -> None:
     graph = imports(ROOT / "tools" / "src" / "salient")
     assert "salient.bench.session" in graph["salient.bench.bench"]
@@ -133,6 +205,54 @@ def test_forbidden_include_is_found(tmp_path: Path, file: str, line: str, found:
     (tmp_path / file).write_text(f"{line}\n")
     graph = includes(tmp_path)
     assert [*upwards(graph, C_LAYERS, "/"), *crossings(graph)] == [found]
+
+
+def write_module(root: Path, module: str, function: str, body: str) -> None:
+    """A module of one function, which takes and returns an int."""
+    (root / module).parent.mkdir(parents=True, exist_ok=True)
+    headers = "".join(f'#include "{name}"\n' for name in ("rig/b.h", "plant/a.h"))
+    (root / f"{module}.h").write_text(f"int {function}(int value);\n")
+    (root / f"{module}.c").write_text(f"{headers}\nint {function}(int value) {{\n    {body}\n}}\n")
+
+
+@pytest.mark.parametrize(("body", "found"), [
+    ("return b_step(value);", ["emulator/plant/a.c -> emulator/rig/b.c"]),
+    ("static int (*const step)(int value) = b_step;\n    return step(value);",
+     ["emulator/plant/a.c -> emulator/rig/b.c"]),
+    ("return value; /* not b_step(value) */", []),
+    ('return "b_step(value)"[value];', []),
+    ("return state.b_step;", []),
+])
+def test_call_of_a_higher_layer_is_found(tmp_path: Path, body: str, found: list[str]) -> None:
+    write_module(tmp_path, "emulator/plant/a", "a_step", body)
+    write_module(tmp_path, "emulator/rig/b", "b_step", "return value;")
+    assert list(upwards(calls(tmp_path), C_LAYERS, "/")) == found
+
+
+def test_call_of_the_hal_is_no_call_of_its_port(tmp_path: Path) -> None:
+    write_module(tmp_path, "emulator/plant/a", "a_step", "return b_step(value);")
+    write_module(tmp_path, "emulator/rig/b", "b_step", "return value;")
+    (tmp_path / "hal").mkdir()
+    (tmp_path / "emulator/rig/b.h").rename(tmp_path / "hal/b.h")
+    source = tmp_path / "emulator/plant/a.c"
+    source.write_text(source.read_text().replace("rig/b.h", "b.h"))
+    assert calls(tmp_path)["emulator/plant/a.c"] == {"hal/b.h"}
+
+
+def test_circle_of_calls_is_found(tmp_path: Path) -> None:
+    write_module(tmp_path, "emulator/plant/a", "a_step", "return b_step(value);")
+    write_module(tmp_path, "emulator/rig/b", "b_step", "return a_step(value);")
+    assert set(circle(modules(calls(tmp_path)))) == {"emulator/plant/a", "emulator/rig/b"}
+
+
+def test_circle_through_a_header_is_found(tmp_path: Path) -> None:
+    write_module(tmp_path, "emulator/rig/b", "b_step", "return a_step(value);")
+    write_module(tmp_path, "emulator/plant/a", "a_step", "return value;")
+    with (tmp_path / "emulator/plant/a.h").open("a") as header:
+        header.write('#include "rig/b.h"\nstatic inline int a_twice(int value) {\n    return 2 * b_step(value);\n}\n')
+    graph = calls(tmp_path)
+    assert list(upwards(graph, C_LAYERS, "/")) == ["emulator/plant/a.h -> emulator/rig/b.c"]
+    assert set(circle(modules(graph))) == {"emulator/plant/a", "emulator/rig/b"}
 
 
 def test_cyclic_include_is_found(tmp_path: Path) -> None:
