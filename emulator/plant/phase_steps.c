@@ -53,6 +53,23 @@ static void cut(walk_t *walk, double end_s) {
     walk->corner = false;
 }
 
+/* Ends the phase's steps up to `at_s` and begins the next ones. False: as walk_end. */
+MAGNETICS_INLINE bool walk_on(plant_t *plant, magnetics_form_t form, unsigned phase, const rotor_step_t *rotor,
+                              link_t *link, double at_s, walk_t *walk, sums_t *sums, phase_record_t *records) {
+    while (walk->end_s <= at_s) {
+        phase_record_t *record = records != NULL ? &records[phase] : NULL;
+        if (walk->active && !walk_end(plant, form, phase, rotor, link, walk, sums, record)) {
+            return false;
+        }
+        if (walk->end_s >= rotor->length_s) {
+            walk_finish(plant, phase, rotor, walk, sums);
+            return true;
+        }
+        walk->active = walk_begin(plant, form, phase, rotor, link, walk);
+    }
+    return true;
+}
+
 /* The same with a link: in the order of time. */
 MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const rotor_step_t *rotor, link_t *link,
                                     sums_t *sums, phase_record_t *records) {
@@ -68,20 +85,10 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
     for (double at_s = 0.0;;) {
         double next_s = rotor->length_s;
         for (unsigned n = 0; n < count; n++) {
-            walk_t *walk = &walks[n];
-            while (walk->end_s <= at_s) {
-                const unsigned phase = phase_of[n];
-                if (walk->active &&
-                    !walk_end(plant, form, phase, rotor, link, walk, sums, records != NULL ? &records[phase] : NULL)) {
-                    return false;
-                }
-                if (walk->end_s >= rotor->length_s) {
-                    walk_finish(plant, phase, rotor, walk, sums);
-                    break;
-                }
-                walk->active = walk_begin(plant, form, phase, rotor, link, walk);
+            if (!walk_on(plant, form, phase_of[n], rotor, link, at_s, &walks[n], sums, records)) {
+                return false;
             }
-            next_s = lesser(walk->end_s, next_s);
+            next_s = lesser(walks[n].end_s, next_s);
         }
         if (at_s >= rotor->length_s) {
             return true;
@@ -97,24 +104,17 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
     }
 }
 
-/* Prepares the rotor's step and the phases at its start. */
-MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_step_t *rotor, uint64_t to_ns) {
-    const unsigned phases = plant->machine->phases;
-    const double speed_rad_s = plant->speed_rad_s, angle_rad = plant->rotor_angle_rad;
-    const double inertia_1 = 1.0 / plant->inertia_kg_m2;
-    for (unsigned on = 0; on < 3; on++) {
-        rotor->voltage_V[on] = ((double)on - 1.0) * plant->bus_voltage_V - plant->drop_V[on];
-    }
-    rotor->driven = rotor->voltage_V[2] > 0.0;
-    rotor->trip_current_A = plant->tripped ? INFINITY : plant->trip_current_A;
-    rotor->current_step_A = CURRENT_STEPS * plant->limits.current_A;
-    rotor->angle_rad = angle_rad;
-    rotor->speed_rad_s = speed_rad_s;
-    rotor->start_ns = (uint32_t)(plant->time_ns - plant->pattern_ns);
-    rotor->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, speed_rad_s);
+/* Torque of the phases at the start of the rotor's step, its time derivative, and the feedback from it through the
+ * angle to the currents. */
+typedef struct {
+    double torque_Nm, torque_Nm_s, coupling_1_s2;
+} start_torque_t;
 
-    double torque_Nm = 0.0, torque_Nm_s = 0.0, coupling_1_s2 = 0.0;
-    for (unsigned phase = 0; phase < phases; phase++) {
+/* Prepares the phases. */
+MAGNETICS_INLINE start_torque_t start_phases(plant_t *plant, magnetics_form_t form, const rotor_step_t *rotor) {
+    const double speed_rad_s = rotor->speed_rad_s, angle_rad = rotor->angle_rad;
+    start_torque_t start = {0.0, 0.0, 0.0};
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         plant_phase_t *state = &plant->phase[phase];
         const double current_A = plant->current_A[phase];
         const unsigned on = half_bridge_on(plant->switches[phase]);
@@ -135,35 +135,61 @@ MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_st
         const double current_A_s =
             (rotor->voltage_V[on] - plant->resistance_ohm[phase][on] * current_A - speed_rad_s * gradient_Wb_rad) *
             state->inverse_1_H;
-        torque_Nm += state->point.torque_Nm;
-        torque_Nm_s += state->point.torque_gradient_Nm_rad * speed_rad_s + gradient_Wb_rad * current_A_s;
-        coupling_1_s2 += gradient_Wb_rad * gradient_Wb_rad * state->inverse_1_H;
+        start.torque_Nm += state->point.torque_Nm;
+        start.torque_Nm_s += state->point.torque_gradient_Nm_rad * speed_rad_s + gradient_Wb_rad * current_A_s;
+        start.coupling_1_s2 += gradient_Wb_rad * gradient_Wb_rad * state->inverse_1_H;
     }
-    coupling_1_s2 *= inertia_1;
-    rotor->acceleration_rad_s2 = (torque_Nm - plant->friction_Nm_s * speed_rad_s - plant->load_torque_Nm) * inertia_1;
-    rotor->jerk_rad_s3 = (torque_Nm_s - plant->friction_Nm_s * rotor->acceleration_rad_s2) * inertia_1;
-    if (plant->held) {
-        rotor->acceleration_rad_s2 = plant->held_acceleration_rad_s2;
-        rotor->jerk_rad_s3 = coupling_1_s2 = 0.0;
-    }
-    rotor->half_rad_s2 = 0.5 * rotor->acceleration_rad_s2;
-    rotor->half_rad_s3 = 0.5 * rotor->jerk_rad_s3;
+    start.coupling_1_s2 *= 1.0 / plant->inertia_kg_m2;
+    return start;
+}
 
-    double limit_s = plant->limits.own_max_s;
-    if (fabs(speed_rad_s) * limit_s > plant->limits.angle_rad) {
-        limit_s = plant->limits.angle_rad / fabs(speed_rad_s);
+/* Length of the rotor's step: a whole part of the time to `to_ns` within the limits. */
+static inline uint64_t step_length_ns(const plant_t *plant, double coupling_1_s2, uint64_t to_ns) {
+    const double speed_rad_s = fabs(plant->speed_rad_s);
+    const plant_limits_t *limits = &plant->limits;
+    double limit_s = limits->own_max_s;
+    if (speed_rad_s * limit_s > limits->angle_rad) {
+        limit_s = limits->angle_rad / speed_rad_s;
     }
-    const double coupling_max = plant->limits.factor * plant->limits.factor * COUPLING_MAX;
+    const double coupling_max = limits->factor * limits->factor * COUPLING_MAX;
     if (coupling_1_s2 * limit_s * limit_s > coupling_max) {
         limit_s = sqrt(coupling_max / coupling_1_s2);
     }
-    uint64_t length_ns = to_ns - plant->time_ns;
-    if ((double)length_ns * S_PER_NS > limit_s) {
-        const uint64_t steps = (uint64_t)ceil((double)length_ns * S_PER_NS / limit_s);
-        length_ns = (length_ns + steps - 1) / steps;
+    const uint64_t length_ns = to_ns - plant->time_ns;
+    if ((double)length_ns * S_PER_NS <= limit_s) {
+        return length_ns;
     }
-    rotor->length_ns = length_ns;
-    rotor->length_s = (double)length_ns * S_PER_NS;
+    const uint64_t steps = (uint64_t)ceil((double)length_ns * S_PER_NS / limit_s);
+    return (length_ns + steps - 1) / steps;
+}
+
+/* Prepares the rotor's step and the phases at its start. */
+MAGNETICS_INLINE void start_step(plant_t *plant, magnetics_form_t form, rotor_step_t *rotor, uint64_t to_ns) {
+    const double speed_rad_s = plant->speed_rad_s, angle_rad = plant->rotor_angle_rad;
+    const double inertia_1 = 1.0 / plant->inertia_kg_m2;
+    for (unsigned on = 0; on < 3; on++) {
+        rotor->voltage_V[on] = ((double)on - 1.0) * plant->bus_voltage_V - plant->drop_V[on];
+    }
+    rotor->driven = rotor->voltage_V[2] > 0.0;
+    rotor->trip_current_A = plant->tripped ? INFINITY : plant->trip_current_A;
+    rotor->current_step_A = CURRENT_STEPS * plant->limits.current_A;
+    rotor->angle_rad = angle_rad;
+    rotor->speed_rad_s = speed_rad_s;
+    rotor->start_ns = (uint32_t)(plant->time_ns - plant->pattern_ns);
+    rotor->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, speed_rad_s);
+
+    start_torque_t start = start_phases(plant, form, rotor);
+    rotor->acceleration_rad_s2 =
+        (start.torque_Nm - plant->friction_Nm_s * speed_rad_s - plant->load_torque_Nm) * inertia_1;
+    rotor->jerk_rad_s3 = (start.torque_Nm_s - plant->friction_Nm_s * rotor->acceleration_rad_s2) * inertia_1;
+    if (plant->held) {
+        rotor->acceleration_rad_s2 = plant->held_acceleration_rad_s2;
+        rotor->jerk_rad_s3 = start.coupling_1_s2 = 0.0;
+    }
+    rotor->half_rad_s2 = 0.5 * rotor->acceleration_rad_s2;
+    rotor->half_rad_s3 = 0.5 * rotor->jerk_rad_s3;
+    rotor->length_ns = step_length_ns(plant, start.coupling_1_s2, to_ns);
+    rotor->length_s = (double)rotor->length_ns * S_PER_NS;
     /* A generous bound: beyond it a phase takes a corner's place for its own. */
     const double reach_rad =
         1.1 * rotor->length_s * (fabs(speed_rad_s) + 2.0 * fabs(rotor->acceleration_rad_s2) * rotor->length_s);
@@ -240,30 +266,58 @@ void phase_steps_reset(plant_t *plant) {
     }
 }
 
+/* What the samples within a step need of it. */
+typedef struct {
+    phase_record_t phases[HAL_PHASES_MAX];
+    link_record_t link;
+} records_t;
+
+/* Walks the phases through the rotor's step. records NULL: not recorded. False: it does not apply. */
+MAGNETICS_INLINE bool walk_phases(plant_t *plant, magnetics_form_t form, bool linked, const rotor_step_t *rotor,
+                                  link_t *link, sums_t *sums, records_t *records) {
+    phase_record_t *phases = NULL;
+    if (records != NULL) {
+        phases = records->phases;
+        for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+            phases[phase].count = 0;
+        }
+        records->link.count = 0;
+    }
+    if (!linked) {
+        return walk_apart(plant, form, rotor, sums, phases);
+    }
+    link_start(link, plant, records != NULL ? &records->link : NULL);
+    return walk_together(plant, form, rotor, link, sums, phases) &&
+           !(records != NULL && records->link.count > LINK_STEPS_MAX);
+}
+
+/* The end of the rotor's step becomes the present state. */
+MAGNETICS_INLINE void finish(plant_t *plant, const rotor_step_t *rotor, const sums_t *sums, double turn_rad,
+                             double gain_rad_s, double correction_rad) {
+    plant->time_ns += rotor->length_ns;
+    plant->rotor_angle_rad = rotor->angle_rad + turn_rad;
+    plant->speed_rad_s = rotor->speed_rad_s + gain_rad_s;
+    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
+        if (sums->walked >> phase & 1u) {
+            plant->switches[phase] = sums->switches[phase];
+            plant->edge_next[phase] = sums->edge_next[phase];
+            if (plant->phase[phase].known) {
+                correct(&plant->phase[phase], plant->rotor_angle_rad, correction_rad);
+            }
+        }
+        plant->current_A[phase] = plant->phase[phase].current_A;
+    }
+}
+
 MAGNETICS_INLINE bool advance_of(plant_t *plant, magnetics_form_t form, bool linked, uint64_t to_ns) {
-    phase_record_t records[HAL_PHASES_MAX];
-    link_record_t link_record;
+    records_t records;
     rotor_step_t rotor;
     start_step(plant, form, &rotor, to_ns);
     const uint64_t end_ns = plant->time_ns + rotor.length_ns;
     const bool sampled = plant->observation.sample != NULL && plant->observation.next_ns < end_ns;
-    if (sampled) {
-        for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-            records[phase].count = 0;
-        }
-        link_record.count = 0;
-    }
     link_t link;
     sums_t sums = {0};
-    bool walked;
-    if (linked) {
-        link_start(&link, plant, sampled ? &link_record : NULL);
-        walked = walk_together(plant, form, &rotor, &link, &sums, sampled ? records : NULL) &&
-                 !(sampled && link_record.count > LINK_STEPS_MAX);
-    } else {
-        walked = walk_apart(plant, form, &rotor, &sums, sampled ? records : NULL);
-    }
-    if (!walked) {
+    if (!walk_phases(plant, form, linked, &rotor, &link, &sums, sampled ? &records : NULL)) {
         phase_steps_reset(plant);
         return false;
     }
@@ -272,25 +326,13 @@ MAGNETICS_INLINE bool advance_of(plant_t *plant, magnetics_form_t form, bool lin
     predicted_rad -= rotor.angle_rad;
     turn(plant, &rotor, &sums, predicted_rad, &turn_rad, &gain_rad_s);
     if (sampled) {
-        phase_samples_take(plant, &rotor, turn_rad - predicted_rad, records, &link_record, end_ns);
+        phase_samples_take(plant, &rotor, turn_rad - predicted_rad, records.phases, &records.link, end_ns);
     }
     add_energies(plant, &rotor, &sums, linked, turn_rad, gain_rad_s);
     if (linked) {
         link_finish(&link, plant);
     }
-    plant->time_ns = end_ns;
-    plant->rotor_angle_rad = rotor.angle_rad + turn_rad;
-    plant->speed_rad_s = rotor.speed_rad_s + gain_rad_s;
-    for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        if (sums.walked >> phase & 1u) {
-            plant->switches[phase] = sums.switches[phase];
-            plant->edge_next[phase] = sums.edge_next[phase];
-            if (plant->phase[phase].known) {
-                correct(&plant->phase[phase], plant->rotor_angle_rad, turn_rad - predicted_rad);
-            }
-        }
-        plant->current_A[phase] = plant->phase[phase].current_A;
-    }
+    finish(plant, &rotor, &sums, turn_rad, gain_rad_s, turn_rad - predicted_rad);
     return true;
 }
 
