@@ -82,9 +82,8 @@ static void copy(const machine_structure_t *structure, const uint8_t *part, void
     }
 }
 
-/* Reads the parts of a file of at least HEADER_BYTES. */
-static bool read_parts(machine_image_t *image, const char *path, size_t size) {
-    const uint8_t *file = image->file;
+/* Checks a file of at least HEADER_BYTES. */
+static bool check_header(const uint8_t *file, const char *path, size_t size) {
     if (memcmp(file, "SALIENTM", LAYOUT_AT) != 0) {
         return fail(path, "not a machine image");
     }
@@ -97,6 +96,25 @@ static bool read_parts(machine_image_t *image, const char *path, size_t size) {
     if (crc32_of(file + CHECKED_AT, size - CHECKED_AT) != word_at(file + CRC_AT)) {
         return fail(path, "damaged machine image: wrong checksum");
     }
+    return true;
+}
+
+static bool sizes_are_right(const uint64_t bytes[PARTS]) {
+    return bytes[PLANT] == machine_plant_structure.bytes && bytes[NAME] > 0 &&
+           (bytes[FLUX_MAP] == 0 || bytes[FLUX_MAP] == flux_map_structure.bytes);
+}
+
+static bool values_are_in_range(const machine_t *machine) {
+    return (machine->magnetics.form == MAGNETICS_MAP) == (machine->magnetics.map != NULL) &&
+           machine->magnetics.form <= MAGNETICS_MAP && machine->phases >= 1 && machine->phases <= HAL_PHASES_MAX;
+}
+
+/* Reads the parts of a file of at least HEADER_BYTES. */
+static bool read_parts(machine_image_t *image, const char *path, size_t size) {
+    const uint8_t *file = image->file;
+    if (!check_header(file, path, size)) {
+        return false;
+    }
     const uint8_t *part[PARTS];
     uint64_t bytes[PARTS], end = HEADER_BYTES;
     for (unsigned i = 0; i < PARTS; i++) {
@@ -104,24 +122,18 @@ static bool read_parts(machine_image_t *image, const char *path, size_t size) {
         part[i] = file + (end < size ? end : size);
         end += bytes[i];
     }
-    const bool has_map = bytes[FLUX_MAP] != 0;
-    if (end != size || bytes[PLANT] != machine_plant_structure.bytes ||
-        (has_map && bytes[FLUX_MAP] != flux_map_structure.bytes) || bytes[NAME] == 0 || file[size - 1] != '\0') {
+    if (end != size || !sizes_are_right(bytes) || file[size - 1] != '\0') {
         return fail(path, "damaged machine image: parts of a wrong size");
     }
     image->tables = part[TABLES];
     image->tables_bytes = (size_t)bytes[TABLES];
     copy(&machine_plant_structure, part[PLANT], &image->machine);
-    if (has_map) {
+    if (bytes[FLUX_MAP] != 0) {
         copy(&flux_map_structure, part[FLUX_MAP], &image->map);
         image->machine.magnetics.map = &image->map;
     }
     image->machine.name = (const char *)part[NAME];
-    if ((image->machine.magnetics.form == MAGNETICS_MAP) != has_map || image->machine.magnetics.form > MAGNETICS_MAP ||
-        image->machine.phases < 1 || image->machine.phases > HAL_PHASES_MAX) {
-        return fail(path, "damaged machine image: values out of range");
-    }
-    return true;
+    return values_are_in_range(&image->machine) || fail(path, "damaged machine image: values out of range");
 }
 
 bool machine_image_open(machine_image_t *image, const char *path) {

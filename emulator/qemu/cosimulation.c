@@ -171,16 +171,13 @@ void cosimulation_abandon(void) {
     simulation_close(&simulation);
 }
 
-void cosimulation_serve(void) {
-    if (mailbox->compare_written) {
-        mailbox->compare_written = 0;
-        hal_pwm_write(&host, &mailbox->compare);
-    }
-    switch ((mailbox_command_t)mailbox->doorbell) {
+/* The commands with which time may run on; false: another one. */
+static bool serve_time(mailbox_command_t command) {
+    switch (command) {
     case MAILBOX_REJECTED:
         rejected = true;
         resume_rig();
-        break;
+        return true;
     case MAILBOX_STARTED:
     case MAILBOX_NEXT:
         if (!mailbox->timed) {
@@ -188,58 +185,77 @@ void cosimulation_serve(void) {
         } else if (!started) {
             mailbox->event = MAILBOX_BACKGROUND;
         }
-        break;
+        return true;
     case MAILBOX_TRIGGER:
         run_to_trigger();
-        break;
+        return true;
     case MAILBOX_INTERRUPT_END:
         /* The drive's counter rounds down: an interrupt that ends at a trigger has missed it. */
         simulation.rigs[0].board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * PWM_TIMER_TICK_NS + 1;
         resume_rig();
-        break;
+        return true;
+    default:
+        return false;
+    }
+}
+
+/* The commands that a function of the HAL serves; false: another one. */
+static bool serve_hal(mailbox_command_t command) {
+    switch (command) {
     case MAILBOX_PWM_START:
         hal_pwm_start(&host, (uint16_t)mailbox->period_ticks);
-        break;
+        return true;
     case MAILBOX_PWM_OPEN_ALL:
         hal_pwm_open_all(&host);
-        break;
+        return true;
     case MAILBOX_PWM_CLEAR_BREAK:
         hal_pwm_clear_break(&host);
-        break;
+        return true;
     case MAILBOX_CAN_RECEIVE:
         mailbox->accepted = hal_can_receive(&host, &mailbox->frame);
         --mailbox->receive_waiting;
-        break;
+        return true;
     case MAILBOX_CAN_REJOIN:
         hal_can_rejoin(&host);
-        break;
+        return true;
     case MAILBOX_CAN_TRANSMIT:
         mailbox->accepted = hal_can_transmit(&host, &mailbox->frame);
-        break;
+        return true;
     case MAILBOX_NVM_READ: {
         const uint64_t value = hal_nvm_read(&host, mailbox->nvm_page, mailbox->nvm_word);
         mailbox->nvm_value[0] = (uint32_t)value;
         mailbox->nvm_value[1] = (uint32_t)(value >> 32);
-        break;
+        return true;
     }
     case MAILBOX_NVM_PROGRAM:
         mailbox->accepted = hal_nvm_program(&host, mailbox->nvm_page, mailbox->nvm_word,
                                             (uint64_t)mailbox->nvm_value[1] << 32 | mailbox->nvm_value[0]);
-        break;
+        return true;
     case MAILBOX_NVM_ERASE:
         mailbox->accepted = hal_nvm_erase(&host, mailbox->nvm_page);
-        break;
+        return true;
     case MAILBOX_RANDOM:
         mailbox->random = hal_random_u32(&host);
-        break;
+        return true;
     case MAILBOX_WATCHDOG_START:
         hal_watchdog_start(&host);
-        break;
+        return true;
     case MAILBOX_WATCHDOG_KICK:
         hal_watchdog_kick(&host);
-        break;
+        return true;
     default:
-        fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)mailbox->doorbell);
+        return false;
+    }
+}
+
+void cosimulation_serve(void) {
+    if (mailbox->compare_written) {
+        mailbox->compare_written = 0;
+        hal_pwm_write(&host, &mailbox->compare);
+    }
+    const mailbox_command_t command = (mailbox_command_t)mailbox->doorbell;
+    if (!serve_time(command) && !serve_hal(command)) {
+        fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)command);
         abort();
     }
 }

@@ -108,55 +108,73 @@ static const board_description_t *board_of(const char *target) {
 }
 
 /* The text after `key` if the argument begins with it, else NULL. */
-static char *value_of(char *argument, const char *key) {
+static const char *value_of(const char *argument, const char *key) {
     return strncmp(argument, key, strlen(key)) == 0 ? argument + strlen(key) : NULL;
 }
 
-int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv) {
-    static options_t options; /* the co-simulation keeps it */
-    char *words[ARGUMENTS_MAX + 1] = {"salient"};
-    int count = 1;
-    const char *mailbox_path = NULL, *control_path = NULL, *deferred_path = NULL, *trace_path = NULL, *stack = "";
-    bool timed = false;
+/* Arguments of the plugin. Strings outlive the installation where they are kept after it. */
+typedef struct {
+    char *words[ARGUMENTS_MAX + 1]; /* command line of the host executable */
+    int count;
+    const char *mailbox, *instructions, *deferred, *execution, *stack, *timed;
+} arguments_t;
+
+static void add_word(arguments_t *arguments, const char *word) {
+    if (arguments->count == ARGUMENTS_MAX) {
+        fprintf(stderr, "salient: more than %d arguments\n", ARGUMENTS_MAX);
+        exit(EXIT_USAGE);
+    }
+    arguments->words[arguments->count++] = strdup(word);
+}
+
+static void parse(arguments_t *arguments, int argc, char **argv) {
+    const struct {
+        const char *key;
+        const char **value;
+    } values[] = {
+        {"mailbox=", &arguments->mailbox},   {"instructions=", &arguments->instructions},
+        {"deferred=", &arguments->deferred}, {"execution=", &arguments->execution},
+        {"stack=", &arguments->stack},       {"timed=", &arguments->timed},
+    };
     for (int i = 0; i < argc; ++i) {
-        char *value;
-        if ((value = value_of(argv[i], "argument="))) {
-            if (count == ARGUMENTS_MAX) {
-                fprintf(stderr, "salient: more than %d arguments\n", ARGUMENTS_MAX);
-                exit(EXIT_USAGE);
+        const char *word = value_of(argv[i], "argument=");
+        bool known = word != NULL;
+        if (word) {
+            add_word(arguments, word);
+        }
+        for (size_t n = 0; !known && n < sizeof values / sizeof values[0]; ++n) {
+            const char *value = value_of(argv[i], values[n].key);
+            if (value) {
+                *values[n].value = strdup(value);
+                known = true;
             }
-            words[count++] = strdup(value);
-        } else if ((value = value_of(argv[i], "mailbox="))) {
-            mailbox_path = value;
-        } else if ((value = value_of(argv[i], "instructions="))) {
-            control_path = strdup(value);
-        } else if ((value = value_of(argv[i], "deferred="))) {
-            deferred_path = strdup(value);
-        } else if ((value = value_of(argv[i], "execution="))) {
-            trace_path = strdup(value);
-        } else if ((value = value_of(argv[i], "stack="))) {
-            stack = value;
-        } else if (strcmp(argv[i], "timed=1") == 0) {
-            timed = true;
-        } else {
+        }
+        if (!known) {
             fprintf(stderr, "salient: %s: unrecognised plugin argument\n", argv[i]);
             exit(EXIT_USAGE);
         }
     }
+}
+
+int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv) {
+    static options_t options; /* the co-simulation keeps it */
+    arguments_t arguments = {.words = {"salient"}, .count = 1, .stack = ""};
+    parse(&arguments, argc, argv);
     board = board_of(info->target_name);
-    if (!mailbox_path || !info->system_emulation || !board) {
+    if (!arguments.mailbox || !info->system_emulation || !board) {
         fputs("salient: this plugin needs a board of boards.h and mailbox=FILE\n", stderr);
         exit(EXIT_USAGE);
     }
-    mailbox = map_mailbox(mailbox_path);
-    const options_result_t result = options_parse(&options, count, words);
-    if (result != OPTIONS_RUN || !cosimulation_open(mailbox, &options, timed)) {
+    mailbox = map_mailbox(arguments.mailbox);
+    const options_result_t result = options_parse(&options, arguments.count, arguments.words);
+    if (result != OPTIONS_RUN || !cosimulation_open(mailbox, &options, arguments.timed != NULL)) {
         exit(result == OPTIONS_HELP ? 0 : EXIT_USAGE);
     }
     on_exit(ended, NULL);
-    counting = control_path || deferred_path;
-    tracing = trace_path;
-    if ((counting && !instructions_open(control_path, deferred_path)) || (tracing && !trace_open(trace_path, stack))) {
+    counting = arguments.instructions || arguments.deferred;
+    tracing = arguments.execution;
+    if ((counting && !instructions_open(arguments.instructions, arguments.deferred)) ||
+        (tracing && !trace_open(arguments.execution, arguments.stack))) {
         exit(EXIT_USAGE);
     }
     qemu_plugin_register_vcpu_tb_trans_cb(id, translate);

@@ -65,89 +65,137 @@ static const board_description_t *board_of(const char *image) {
     return NULL;
 }
 
-int main(int argc, char *argv[]) {
-    if (argc < 2 || strcmp(argv[1], "--help") == 0) {
-        printf("usage: %s IMAGE.elf [--instructions FILE] [--deferred-instructions FILE] [--execution FILE STACK] "
-               "[--instruction-ns N] OPTION...\n"
-               "  IMAGE.elf            the drive, as built for a board of QEMU\n"
-               "  --instructions FILE  writes the number of instructions of each control interrupt as uint32_t\n"
-               "  --deferred-instructions FILE  the same of each deferred interrupt\n"
-               "  --execution FILE STACK  writes the execution count of each block of instructions and the lowest\n"
-               "                       address written on the stack, whose limits are STACK: END-BEGIN, hexadecimal\n"
-               "  --instruction-ns N   execution time per instruction: a power of two up to 64; without this option\n"
-               "                       instructions take no time\n"
-               "  OPTION               as the host executable's; its --help lists them\n",
-               argv[0]);
-        return argc < 2 ? EXIT_USAGE : 0;
+/* Options of this program, which precede those of the host executable. */
+enum { INSTRUCTIONS, DEFERRED_INSTRUCTIONS, EXECUTION, INSTRUCTION_NS, OPTIONS };
+#define VALUES_MAX 2
+
+typedef struct {
+    const char *name;
+    const char *keys[VALUES_MAX]; /* of the plugin, for its values; NULL: no value, or none for the plugin */
+    int values;
+    const char *usage, *help;
+} own_option_t;
+
+static const own_option_t own_options[OPTIONS] = {
+    [INSTRUCTIONS] = {"--instructions",
+                      {"instructions"},
+                      1,
+                      "--instructions FILE",
+                      "writes the number of instructions of each control interrupt as uint32_t"},
+    [DEFERRED_INSTRUCTIONS] = {"--deferred-instructions",
+                               {"deferred"},
+                               1,
+                               "--deferred-instructions FILE",
+                               "the same of each deferred interrupt"},
+    [EXECUTION] =
+        {"--execution",
+         {"execution", "stack"},
+         2,
+         "--execution FILE STACK",
+         "writes the execution count of each block of instructions and the lowest address\n"
+         "                                written on the stack, whose limits are STACK: END-BEGIN, hexadecimal"},
+    [INSTRUCTION_NS] = {"--instruction-ns",
+                        {NULL},
+                        1,
+                        "--instruction-ns N",
+                        "execution time per instruction: a power of two up to 64; without this option\n"
+                        "                                instructions take no time"},
+};
+
+/* Values of the options of this program, NULL where one is not given, and the arguments of the host executable. */
+typedef struct {
+    const char *image;
+    char *const *values[OPTIONS];
+    int count;
+    char *const *arguments;
+} invocation_t;
+
+static void print_usage(const char *program) {
+    printf("usage: %s IMAGE.elf", program);
+    for (unsigned i = 0; i < OPTIONS; ++i) {
+        printf(" [%s]", own_options[i].usage);
     }
-    const char *image = argv[1], *instructions = NULL, *deferred = NULL, *execution = NULL, *stack = NULL,
-               *instruction_ns = NULL;
-    int first = 2;
-    if (argc > first + 1 && strcmp(argv[first], "--instructions") == 0) {
-        instructions = argv[first + 1];
-        first += 2;
+    printf(" OPTION...\n"
+           "  IMAGE.elf                     the drive, as built for a board of QEMU\n");
+    for (unsigned i = 0; i < OPTIONS; ++i) {
+        printf("  %-29s %s\n", own_options[i].usage, own_options[i].help);
     }
-    if (argc > first + 1 && strcmp(argv[first], "--deferred-instructions") == 0) {
-        deferred = argv[first + 1];
-        first += 2;
+    printf("  OPTION                        as the host executable's; its --help lists them\n");
+}
+
+/* The option of this program that `arguments` begin with, with all its values; OPTIONS: none. */
+static unsigned own_option(int count, char *const *arguments) {
+    unsigned option = 0;
+    while (option < OPTIONS &&
+           !(count > own_options[option].values && strcmp(arguments[0], own_options[option].name) == 0)) {
+        ++option;
     }
-    if (argc > first + 2 && strcmp(argv[first], "--execution") == 0) {
-        execution = argv[first + 1];
-        stack = argv[first + 2];
-        first += 3;
+    return option;
+}
+
+static invocation_t parse(int argc, char *argv[]) {
+    invocation_t invocation = {.image = argv[1], .count = argc - 2, .arguments = argv + 2};
+    for (;;) {
+        const unsigned option = own_option(invocation.count, invocation.arguments);
+        if (option == OPTIONS) {
+            return invocation;
+        }
+        invocation.values[option] = invocation.arguments + 1;
+        invocation.count -= 1 + own_options[option].values;
+        invocation.arguments += 1 + own_options[option].values;
     }
-    if (argc > first + 1 && strcmp(argv[first], "--instruction-ns") == 0) {
-        instruction_ns = argv[first + 1];
-        first += 2;
+}
+
+/* Shift of the time per instruction, 0 without one; -1, after one line on stderr, when it is not possible. */
+static int instruction_shift(const invocation_t *invocation, const board_description_t *board) {
+    if (!invocation->values[INSTRUCTION_NS]) {
+        return 0;
     }
-    const board_description_t *board = board_of(image);
-    if (!board) {
-        return EXIT_USAGE;
-    }
-    const int shift = instruction_ns ? shift_of(instruction_ns) : 0;
+    const char *number = invocation->values[INSTRUCTION_NS][0];
+    const int shift = shift_of(number);
     if (shift < 0) {
-        fprintf(stderr, "salient: --instruction-ns %s: must be 1, 2, 4, 8, 16, 32 or 64\n", instruction_ns);
-        return EXIT_USAGE;
-    }
-    if (instruction_ns && !board->timer) {
-        fprintf(stderr, "salient: --instruction-ns %s: not on the board %s, whose port uses no timer\n", instruction_ns,
+        fprintf(stderr, "salient: --instruction-ns %s: must be 1, 2, 4, 8, 16, 32 or 64\n", number);
+    } else if (!board->timer) {
+        fprintf(stderr, "salient: --instruction-ns %s: not on the board %s, whose port uses no timer\n", number,
                 board->machine);
-        return EXIT_USAGE;
+        return -1;
     }
+    return shift;
+}
+
+/* The plugin with its arguments, as QEMU's option takes them. On the heap, for the life of the program. */
+static char *plugin_option(const invocation_t *invocation, const char *mailbox) {
+    char *plugin = NULL;
+    size_t size;
+    FILE *list = open_memstream(&plugin, &size);
+    fputs(SALIENT_PLUGIN, list);
+    put_option(list, "mailbox", mailbox);
+    for (unsigned option = 0; option < OPTIONS; ++option) {
+        for (unsigned n = 0; n < VALUES_MAX && invocation->values[option] && own_options[option].keys[n]; ++n) {
+            put_option(list, own_options[option].keys[n], invocation->values[option][n]);
+        }
+    }
+    if (invocation->values[INSTRUCTION_NS]) {
+        put_option(list, "timed", "1");
+    }
+    for (int i = 0; i < invocation->count; ++i) {
+        put_option(list, "argument", invocation->arguments[i]);
+    }
+    fclose(list);
+    return plugin;
+}
+
+/* Becomes QEMU; returns the exit code when that is not possible. */
+static int become_qemu(const invocation_t *invocation, const board_description_t *board, int shift) {
     const int memory = memfd_create("salient mailbox", 0); /* inherited by QEMU, freed when it ends */
     if (memory < 0 || ftruncate(memory, board->memory_bytes) != 0) {
         return system_error("the board's memory");
     }
-    char path[64], *machine = NULL, *object = NULL, *plugin = NULL;
-    size_t size;
+    char path[64], machine[64], object[160], card[64] = "none", clock[64], name[64];
     snprintf(path, sizeof path, "/proc/self/fd/%d", memory);
-    FILE *list = open_memstream(&machine, &size);
-    fprintf(list, "%s,memory-backend=shared", board->machine);
-    fclose(list);
-    list = open_memstream(&object, &size);
-    fprintf(list, "memory-backend-file,id=shared,size=%u,share=on,mem-path=%s", (unsigned)board->memory_bytes, path);
-    fclose(list);
-    list = open_memstream(&plugin, &size);
-    fputs(SALIENT_PLUGIN, list);
-    put_option(list, "mailbox", path);
-    if (instructions) {
-        put_option(list, "instructions", instructions);
-    }
-    if (deferred) {
-        put_option(list, "deferred", deferred);
-    }
-    if (execution) {
-        put_option(list, "execution", execution);
-        put_option(list, "stack", stack);
-    }
-    if (instruction_ns) {
-        fputs(",timed=1", list);
-    }
-    for (int i = first; i < argc; ++i) {
-        put_option(list, "argument", argv[i]);
-    }
-    fclose(list);
-    char card[64] = "none";
+    snprintf(machine, sizeof machine, "%s,memory-backend=shared", board->machine);
+    snprintf(object, sizeof object, "memory-backend-file,id=shared,size=%u,share=on,mem-path=%s",
+             (unsigned)board->memory_bytes, path);
     if (board->network_card) { /* QEMU warns about an unconnected card */
         int network[2];
         if (socketpair(AF_UNIX, SOCK_DGRAM, 0, network) != 0) {
@@ -156,12 +204,25 @@ int main(int argc, char *argv[]) {
         snprintf(card, sizeof card, "socket,model=%s,fd=%d", board->network_card, network[0]);
     }
     /* The clock of the timers counts instructions only. */
-    char clock[64];
     snprintf(clock, sizeof clock, "shift=%d,align=off,sleep=off", shift);
     execlp(board->program, board->program, "-nodefaults", "-display", "none", "-nic", card, "-machine", machine,
-           "-object", object, "-semihosting-config", "enable=on,target=native", "-bios", "none", "-kernel", image,
-           "-plugin", plugin, instruction_ns ? "-icount" : (char *)NULL, clock, (char *)NULL);
-    char name[64];
+           "-object", object, "-semihosting-config", "enable=on,target=native", "-bios", "none", "-kernel",
+           invocation->image, "-plugin", plugin_option(invocation, path),
+           invocation->values[INSTRUCTION_NS] ? "-icount" : (char *)NULL, clock, (char *)NULL);
     snprintf(name, sizeof name, "%s (Debian package %s)", board->program, board->package);
     return system_error(name);
+}
+
+int main(int argc, char *argv[]) {
+    if (argc < 2 || strcmp(argv[1], "--help") == 0) {
+        print_usage(argv[0]);
+        return argc < 2 ? EXIT_USAGE : 0;
+    }
+    const invocation_t invocation = parse(argc, argv);
+    const board_description_t *board = board_of(invocation.image);
+    if (!board) {
+        return EXIT_USAGE;
+    }
+    const int shift = instruction_shift(&invocation, board);
+    return shift < 0 ? EXIT_USAGE : become_qemu(&invocation, board, shift);
 }

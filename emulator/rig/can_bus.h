@@ -24,14 +24,15 @@
 #include "hal_can.h"
 #include "rig/can_faults.h"
 #include "rig/can_length.h"
+#include "rig/can_line.h"
 #include "rig/can_node.h"
+#include "rig/can_wire.h"
 
 #define CAN_BUS_CLIENT_QUEUE CAN_NODE_QUEUE_MAX
 #define CAN_BUS_BIT_RATE_MIN 10000
 #define CAN_BUS_BIT_RATE_MAX 1000000
 #define CAN_BUS_NEVER UINT64_MAX
 #define CAN_BUS_DRIVES_MAX 8
-#define CAN_BUS_TRANSMITTERS_MAX 64 /* nodes that transmit the same arbitration field at once; others wait */
 
 typedef struct {
     hal_can_frame_t frame;
@@ -53,26 +54,6 @@ typedef struct {
 } can_babble_t;
 
 typedef struct {
-    can_node_t *node;
-    can_mailbox_t *mailbox;
-} can_transmitter_t;
-
-/* One pair of wires. */
-typedef struct {
-    enum { CAN_LINE_IDLE, CAN_LINE_FRAME, CAN_LINE_ERROR_FRAME } state;
-    uint64_t next_event_ns;
-    uint64_t frame_start_ns;
-    uint64_t idle_from_ns;      /* next start of frame */
-    uint64_t recessive_from_ns; /* while idle: since the last dominant bit */
-    unsigned bits;              /* until the event */
-    unsigned bits_to_idle;      /* after it */
-    unsigned recessive_bits;    /* before it, without a dominant one */
-    bool acknowledge_error;
-    unsigned transmitters, remaining; /* the first `remaining` send to the end; the others have lost a bit */
-    can_transmitter_t transmitter[CAN_BUS_TRANSMITTERS_MAX];
-} can_line_t;
-
-typedef struct {
     can_node_t node;
     can_line_t alone;              /* its line while it is disconnected */
     bool disconnected, disconnect; /* now, and from the end of the present frame on */
@@ -92,6 +73,7 @@ typedef struct {
 
     /* Private to can_bus.c. */
     can_length_t lengths;
+    can_wire_t wires[CAN_LINE_TRANSMITTERS_MAX]; /* of a collision */
     uint32_t bit_rate;
     can_line_t shared;
     can_bus_drive_t drives[CAN_BUS_DRIVES_MAX];
