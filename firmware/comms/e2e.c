@@ -19,13 +19,6 @@ static uint16_t checksum(uint16_t data_id, const uint8_t *bytes, size_t length) 
     return e2e_crc16(e2e_crc16(CRC_START, bytes + 2, length - 2), id, sizeof id);
 }
 
-void e2e_protect(uint16_t data_id, uint8_t counter, uint8_t *bytes, size_t length) {
-    bytes[2] = counter;
-    const uint16_t crc = checksum(data_id, bytes, length);
-    bytes[0] = (uint8_t)(crc & 0xFFu);
-    bytes[1] = (uint8_t)(crc >> 8);
-}
-
 void e2e_receiver_init(e2e_receiver_t *receiver) {
     *receiver = (e2e_receiver_t){0};
 }

@@ -42,9 +42,6 @@ typedef struct {
  * from `crc`; the first call passes 0xFFFF. The CRC of "123456789" is 0x29B1. */
 uint16_t e2e_crc16(uint16_t crc, const uint8_t *bytes, size_t length);
 
-/* Writes counter and checksum into a frame of `length` >= E2E_HEADER_BYTES bytes whose data is in place. */
-void e2e_protect(uint16_t data_id, uint8_t counter, uint8_t *bytes, size_t length);
-
 /* Initialises a receiver that accepts the next valid frame with any counter. */
 void e2e_receiver_init(e2e_receiver_t *receiver);
 

@@ -56,10 +56,6 @@ misalignment_parameters_t misalignment_configure(const misalignment_settings_t *
     };
 }
 
-void misalignment_reset(misalignment_t *misalignment) {
-    *misalignment = (misalignment_t){.phase_index = 0};
-}
-
 /* First-order low-pass: value += gain (target - value), gain in Q0.16. Added in two halves, because a gain in Q32 would
  * not fit in 32 bits. */
 static inline void low_pass_step(int32_t *value, int32_t target, int32_t gain_q16) {

@@ -214,7 +214,3 @@ void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters
         parameters->retrigger_holdoff_ticks +
         (uint32_t)(((uint64_t)(parameters->retrigger_holdoff_ticks << 16) * statistics->holdoff_extension_q16) >> 32);
 }
-
-bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage) {
-    return !parameters->adaptive || stage >= parameters->steady_stage_edge;
-}

@@ -145,7 +145,4 @@ void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters
                                uint32_t angle_step, uint32_t rounding_q4, uint32_t withheld_stages,
                                observer_bandwidth_limits_t *limits);
 
-/* True at the steady bandwidth, always without scheduling. */
-bool observer_bandwidth_steady(const observer_bandwidth_parameters_t *parameters, unsigned stage);
-
 #endif

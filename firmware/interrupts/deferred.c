@@ -524,13 +524,3 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }
 }
-
-bool deferred_step(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
-    const deferred_request_t *request = &state->deferred_request;
-    if (!deferred_pending(request, &state->deferred.response)) {
-        return false;
-    }
-    deferred_compute(parameters, state, command);
-    deferred_complete(request, &state->deferred.response);
-    return true;
-}

@@ -46,9 +46,6 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
  */
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command);
 
-/* Both of them, when a step is pending; else returns false. [deferred] */
-bool deferred_step(const control_parameters_t *parameters, control_state_t *state, const command_t *command);
-
 /* Resets for the next run: conduction angles of torque sharing. [both] */
 void deferred_reset_run(control_state_t *state);
 

@@ -11,6 +11,7 @@ extern "C" {
 #include "interrupts/control_step.h"
 #include "interrupts/deferred.h"
 }
+#include "support/deferred_step.h"
 #include "support/equal_parameters.h"
 #include "support/whole_sample.h"
 

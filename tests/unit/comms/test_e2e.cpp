@@ -9,6 +9,8 @@ extern "C" {
 #include "comms/e2e.h"
 }
 
+#include "support/e2e_protect.h"
+
 namespace {
 
 constexpr uint16_t DATA_ID = 0x5A1E;

@@ -51,7 +51,6 @@ double degrees(double rad) {
 class Machine {
   public:
     explicit Machine(int32_t rate_1_s, const offsets_t &off_deg) : parameters(parameters_of(rate_1_s)), off(off_deg) {
-        misalignment_reset(&state);
         model = reference_model::model_of(parameters, PHASES, RATE_HZ);
     }
 
@@ -387,8 +386,7 @@ TEST(Misalignment, the_common_angle_is_not_learned_while_unsteady) {
 TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
     const misalignment_parameters_t p = parameters_of(100);
     for (const int32_t sign : {1, -1}) {
-        misalignment_t state;
-        misalignment_reset(&state);
+        misalignment_t state{};
         for (uint32_t k = 0; k < 2 * RATE_HZ; k++) {
             const bool on = k / 400 % 2 == 0;
             const misalignment_sample_t sample = {
@@ -414,8 +412,7 @@ TEST(Misalignment, is_limited_to_four_degrees_and_overflows_nothing) {
 // The ripple teaches nothing: the phases in turn, each by its own angle, with its slope at hand.
 TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_half_of_the_rate) {
     const misalignment_parameters_t parameters = parameters_of(8);
-    misalignment_t state;
-    misalignment_reset(&state);
+    misalignment_t state{};
     state.steady_updates = 100;
     const auto told = int32_t(electrical_rev_of(0.01) * REV);
     const int updates = int(RATE_HZ) / 4;

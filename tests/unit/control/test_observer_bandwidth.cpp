@@ -68,7 +68,7 @@ class Bandwidth {
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 
-    bool steady() const { return observer_bandwidth_steady(&parameters, state.stage); }
+    bool steady() const { return !parameters.adaptive || state.stage >= parameters.steady_stage_edge; }
 
     void settle(bool from_edge = false) {
         while (!steady()) {

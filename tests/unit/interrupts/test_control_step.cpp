@@ -20,6 +20,7 @@ uint32_t hal_can_receive_overflows(const hal_t *) {
 }
 
 #include "support/configured.h"
+#include "support/deferred_step.h"
 #include "support/reference_models.h"
 #include "support/whole_sample.h"
 

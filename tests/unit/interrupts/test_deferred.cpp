@@ -12,6 +12,7 @@ extern "C" {
 }
 
 #include "support/configured.h"
+#include "support/deferred_step.h"
 #include "support/fixed_point.h"
 #include "support/whole_sample.h"
 

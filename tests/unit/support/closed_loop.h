@@ -20,6 +20,7 @@ extern "C" {
 #include "plant/sensors.h"
 }
 
+#include "support/deferred_step.h"
 #include "support/salient_reference.h"
 #include "support/whole_sample.h"
 

@@ -13,6 +13,8 @@ extern "C" {
 #include "hal_can.h"
 }
 
+#include "support/e2e_protect.h"
+
 namespace frames {
 
 // A command's frame with its checksum; pack: the packing of the message.
