@@ -10,9 +10,9 @@
  * port's structure, so several drives can share a process. Ports: emulator/host (the emulated board), hal/qemu (boards
  * of QEMU).
  *
- * Each function states the contexts from which it may be called: [interrupt] the control interrupt, [deferred] the
- * deferred interrupt, [background] the main loop, [both] interrupt and background. The control interrupt pre-empts the
- * deferred interrupt and the background, the deferred interrupt pre-empts the background, never the reverse.
+ * Each function states the contexts from which it may be called: [control interrupt], [deferred interrupt],
+ * [background], the main loop, or [any] of the three. The control interrupt pre-empts the deferred interrupt and the
+ * background, the deferred interrupt pre-empts the background, never the reverse.
  */
 #ifndef HAL_H
 #define HAL_H

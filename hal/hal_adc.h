@@ -20,10 +20,10 @@ typedef struct {
     uint16_t load_torque_counts; /* positive against the forward direction */
 } hal_adc_sample_t;
 
-/* Resolution in bits, 12..16; constant. [both] */
+/* Resolution in bits, 12..16; constant. [background] */
 unsigned hal_adc_bits(const hal_t *hal);
 
-/* The conversion results of this period's sample. [interrupt] */
+/* The conversion results of this period's sample. [control interrupt] */
 void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample);
 
 /* Temperature sensors, one in each winding and one in the switches of each phase, converted in the background. A code

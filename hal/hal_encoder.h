@@ -19,10 +19,10 @@ typedef struct {
     uint32_t edge_age_ticks; /* from the edge to the latch, in ticks of the PWM timer, nearest; 0..2^31-1, saturated */
 } hal_encoder_sample_t;
 
-/* Bits of one mechanical turn, 8..32; constant. [both] */
+/* Bits of one mechanical turn, 8..32; constant. [background] */
 unsigned hal_encoder_bits(const hal_t *hal);
 
-/* This period's latch. [interrupt] */
+/* This period's latch. [control interrupt] */
 void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample);
 
 #endif

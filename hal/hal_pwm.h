@@ -35,10 +35,10 @@ uint32_t hal_pwm_clock_hz(const hal_t *hal);
  */
 void hal_pwm_start(hal_t *hal, uint16_t period_ticks);
 
-/* Buffers the compare values of the next period. [interrupt] */
+/* Buffers the compare values of the next period. [control interrupt] */
 void hal_pwm_write(hal_t *hal, const hal_pwm_compare_t *compare);
 
-/* Opens every switch now, not at the next period, and clears the buffer. [both] */
+/* Opens every switch now, not at the next period, and clears the buffer. [control interrupt, background] */
 void hal_pwm_open_all(hal_t *hal);
 
 /* Causes of a break. A break opens every switch without the firmware, within the response of the hardware, and keeps
@@ -56,11 +56,11 @@ void hal_pwm_open_all(hal_t *hal);
 #define HAL_PWM_BREAK_STO_1 4u
 #define HAL_PWM_BREAK_STO_2 8u
 
-/* Latched causes, HAL_PWM_BREAK_*; 0: none. [interrupt] */
+/* Latched causes, HAL_PWM_BREAK_*; 0: none. [control interrupt] */
 uint32_t hal_pwm_break(const hal_t *hal);
 
 /* Clears the causes that have gone; without a cause left, compare values act again. The caller has called
- * hal_pwm_open_all before. [interrupt] */
+ * hal_pwm_open_all before. [control interrupt] */
 void hal_pwm_clear_break(hal_t *hal);
 
 #endif

@@ -6,7 +6,7 @@
 
 #include "hal.h"
 
-/* Microseconds since start; wraps after 71 minutes. [both] */
+/* Microseconds since start; wraps after 71 minutes. [any] */
 uint32_t hal_time_us(const hal_t *hal);
 
 /* The same by a second clock, that of the watchdog, with an oscillator of its own and from any beginning. [background]

@@ -23,10 +23,10 @@ typedef struct {
     int32_t gain_q24[BP_OUTPUTS]; /* kp, ki, kd, duty per scaled error, Q7.24, 0..4 */
 } bp_tuner_t;
 
-/* Initial weights from the seed, gains at half of their scales: those of an error of 0. [deferred] */
+/* Initial weights from the seed, gains at half of their scales: those of an error of 0. [deferred interrupt] */
 void bp_tuner_reset(const bp_pid_parameters_t *parameters, bp_tuner_t *tuner);
 
-/* One sample of the PID, which is handed over once. Gains are rounded to nearest. [deferred] */
+/* One sample of the PID, which is handed over once. Gains are rounded to nearest. [deferred interrupt] */
 void bp_tuner_step(const bp_pid_parameters_t *parameters, bp_tuner_t *tuner, const bp_pid_sample_t *sample);
 
 #endif

@@ -106,7 +106,7 @@ typedef struct {
 
 /* Plan for the coming periods. S from the differences of torque and flux linkage over an eighth of the current; where
  * the torque does not rise with the current, the largest factor. Lead: the rotation in two periods and half of the rise
- * of the current. [deferred] */
+ * of the current. [deferred interrupt] */
 pwm_ditc_plan_t pwm_ditc_plan(const pwm_ditc_parameters_t *parameters, const machine_tables_t *tables,
                               const pwm_ditc_plan_sample_t *sample);
 

@@ -45,10 +45,10 @@ typedef struct {
     hal_pwm_compare_t compare; /* of the last period in RUN; written by the control interrupt */
     uint32_t break_causes;     /* of the last control interrupt, HAL_PWM_BREAK_*; written by it */
     /* Execution time of the interrupts, for telemetry only; overruns are handled by monitors/protection.h. */
-    uint32_t used_ticks;           /* last control interrupt, from trigger to end, ticks of the timer */
-    uint32_t worst_ticks;          /* maximum since start */
-    uint32_t deferred_used_ticks;  /* last deferred interrupt, from the trigger of its period to its end; this and the
-                                      next  are written by the deferred interrupt */
+    uint32_t used_ticks;  /* last control interrupt, from trigger to end, ticks of the timer */
+    uint32_t worst_ticks; /* maximum since start */
+    /* Written by the deferred interrupt. */
+    uint32_t deferred_used_ticks;  /* last deferred interrupt, from the trigger of its period to its end */
     uint32_t deferred_worst_ticks; /* maximum since start */
     /* Used by the background only. */
     uint32_t processor_time_q24; /* LSB of telemetry, 5 ns, per tick */
@@ -76,7 +76,8 @@ typedef struct {
     uint32_t ramp_us;      /* time of the last step */
     comms_t comms;
     nvm_store_t store;
-    /* Written by the control interrupt. Last: members behind it would be out of the reach of short instructions. */
+    /* Written by the control interrupt. Last because it is large: loads and stores reach a limited offset in one
+     * instruction. */
     fault_trace_t trace;
 } drive_t;
 
@@ -86,10 +87,10 @@ typedef struct {
  * [background, before anything else] */
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 
-/* One control period. [interrupt] */
+/* One control period. [control interrupt] */
 void drive_control_interrupt(drive_t *drive);
 
-/* The deferred step that the control interrupt has requested (interrupts/deferred.h). [deferred] */
+/* The deferred step that the control interrupt has requested (interrupts/deferred.h). [deferred interrupt] */
 void drive_deferred_interrupt(drive_t *drive);
 
 /* Commands, telemetry, parameters; returns immediately when nothing is due. [background] */

@@ -214,7 +214,7 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 
 /* One control period. command: the last accepted one, COMMAND_OFF before the first. Returns false when every switch
  * must be open; then *compare is all zero, else the values of the machine's phases are set. A deferred step
- * (deferred.h) is requested, unless state->deferred_request.skipped > 0. [interrupt] */
+ * (deferred.h) is requested, unless state->deferred_request.skipped > 0. [control interrupt] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare);
 

@@ -32,28 +32,29 @@
 #define DEFERRED_COMMON_PERIODS 8
 #define DEFERRED_CONDUCTION_PERIODS (CONDUCTION_STEPS * DEFERRED_SLOW_PERIODS)
 
-/* Results in effect. [interrupt, or background in a critical section] */
+/* Results in effect. [control interrupt, or background in a critical section] */
 static inline const deferred_results_t *deferred_in_effect(const control_state_t *state) {
     return deferred_results(&state->deferred_request, &state->deferred.response);
 }
 
-/* Hands the values of this period over, or counts the period as skipped. run: in state RUN. [interrupt] */
+/* Hands the values of this period over, or counts the period as skipped. run: in state RUN. [control interrupt] */
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                         const command_t *command, const control_measurement_t *measured, bool run);
 
 /* Computes the results of the pending step; deferred_complete() then puts them into effect. The control interrupt may
- * pre-empt both. command: the last accepted one; the background, which alone changes it, waits for the step. [deferred]
- */
+ * pre-empt both. command: the last accepted one; the background, which alone changes it, waits for the step.
+ * [deferred interrupt] */
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command);
 
-/* Resets for the next run: conduction angles of torque sharing. [both] */
+/* Resets for the next run: conduction angles of torque sharing.
+ * [control interrupt, or background in a critical section] */
 void deferred_reset_run(control_state_t *state);
 
 /* Makes the speed law that of changed parameters; no other state follows from tunable ones (parameters.h). [background,
  * in a critical section] */
 void deferred_tune(const control_parameters_t *parameters, control_state_t *state);
 
-/* Resets with the observer: statistics of the innovation. [interrupt] */
+/* Resets with the observer: statistics of the innovation. [control interrupt] */
 void deferred_reset_observer(control_state_t *state);
 
 #endif

@@ -1,8 +1,8 @@
 /* Data between the control interrupt and the deferred interrupt, which the former pre-empts at any instruction.
  *
  *   control interrupt    deferred_request_t     input of a deferred step; not written while the step is pending
- *   deferred interrupt   deferred_response_t    results in one of two buffers, selected by one store when they are
- * whole
+ *   deferred interrupt   deferred_response_t    results in one of two buffers; one store selects the
+ *                                                complete one
  *
  * Each structure is written by one of the two only, and read by the other. A deferred step is pending from its request
  * until its end. The control interrupt requests none in a period in which one is pending, and counts that period as
@@ -69,9 +69,9 @@ typedef struct {
     int32_t torque_max_q24;       /* both are the reference in torque mode */
 } deferred_speed_results_t;
 
-/* Results that act from the next control period on; all zero: none, but for the conduction angles and the
- * inertia. In parts that
- * are copied without a call of memcpy, which took 79 instructions of a reset. */
+/* Results that act from the next control period on. All zero means no effect, except for the conduction angles and the
+ * inertia, which have initial values. Divided into parts small enough to be copied without a call of memcpy, which took
+ * 79 instructions of a reset. */
 typedef struct {
     uint32_t generation; /* of the input */
     uint32_t fault_mask; /* failed deferred checks, lower half of their FAULT_BITs */
@@ -105,7 +105,7 @@ static inline bool deferred_pending(const deferred_request_t *request, const def
     return request->requests != response->completed;
 }
 
-/* Results in effect. [interrupt, or background in a critical section] */
+/* Results in effect. [control interrupt, or background in a critical section] */
 static inline const deferred_results_t *deferred_results(const deferred_request_t *request,
                                                          const deferred_response_t *response) {
     const deferred_results_t *results = &response->results[response->latest];
@@ -113,24 +113,24 @@ static inline const deferred_results_t *deferred_results(const deferred_request_
     return results->generation == request->generation ? results : &request->initial;
 }
 
-/* Requests a step with the input, which has been written while none was pending. [interrupt] */
+/* Requests a step with the input, which has been written while none was pending. [control interrupt] */
 static inline void deferred_request(deferred_request_t *request) {
     request->requests++;
     request->skipped = 0;
 }
 
-/* Counts a period in which a step is still pending. [interrupt] */
+/* Counts a period in which a step is still pending. [control interrupt] */
 static inline void deferred_skip(deferred_request_t *request) {
     request->skipped++;
     request->skipped_total++;
 }
 
-/* Buffer for the results of the pending step. [deferred] */
+/* Buffer for the results of the pending step. [deferred interrupt] */
 static inline deferred_results_t *deferred_buffer(deferred_response_t *response) {
     return &response->results[response->latest ^ 1u];
 }
 
-/* Puts the buffer into effect and ends the step. The order of the stores matters. [deferred] */
+/* Puts the buffer into effect and ends the step. The order of the stores matters. [deferred interrupt] */
 static inline void deferred_complete(const deferred_request_t *request, deferred_response_t *response) {
     __atomic_signal_fence(__ATOMIC_RELEASE);
     *(volatile uint32_t *)&response->latest = response->latest ^ 1u;

@@ -41,7 +41,7 @@ typedef struct {
     int32_t torque_reference_q24;
 } fault_trace_values_t;
 
-/* Records a period in RUN. [interrupt] */
+/* Records a period in RUN. [control interrupt] */
 ALWAYS_INLINE void fault_trace_run(fault_trace_t *trace, const fault_trace_values_t *values) {
     const uint32_t place = trace->next % FAULT_TRACE_PERIODS;
     fault_trace_period_t *period = &trace->period[place];
@@ -53,7 +53,7 @@ ALWAYS_INLINE void fault_trace_run(fault_trace_t *trace, const fault_trace_value
     trace->next = place + 1u;
 }
 
-/* Records a period in another state; not while the trace is kept. [interrupt] */
+/* Records a period in another state; not while the trace is kept. [control interrupt] */
 void fault_trace_stand(fault_trace_t *trace, const fault_trace_values_t *values, drive_state_t state);
 
 /* A period of a trace that is kept, the oldest first; NULL when none is kept or there is no such period. [background]

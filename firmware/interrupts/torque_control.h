@@ -14,10 +14,10 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
                     const control_measurement_t *measured);
 
 /* Limit of the currents of hysteresis control at a speed, rad/s, Q9.22; its results are those of the next period:
- * 10 of the computed bound of traditional. [deferred] */
+ * 10 of the computed bound of traditional. [deferred interrupt] */
 ditc_hysteresis_limit_t torque_control_limit(const control_parameters_t *parameters, int32_t speed_q22);
 
-/* True when the last period in RUN was limited by the DC-link voltage. [both] */
+/* True when the last period in RUN was limited by the DC-link voltage. [background] */
 bool torque_control_voltage_saturated(const control_parameters_t *parameters, const control_state_t *state);
 
 #endif
