@@ -25,14 +25,15 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 }
 
 /* The first sample initialises what compares successive samples; all else is that of control_reset. */
-static void start(control_state_t *state, const control_measurement_t *measured) {
+static void start(control_state_t *state) {
     state->started = true;
-    load_observer_reset(&state->observer, measured->angle);
-    protection_reset(&state->protection, measured->encoder_angle);
+    load_observer_reset(&state->observer, state->measurement.angle);
+    protection_reset(&state->protection, state->measurement.encoder_angle);
 }
 
-static uint64_t protect(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                        const control_measurement_t *measured) {
+static uint64_t protect(const control_parameters_t *parameters, control_state_t *state,
+                        const control_sample_t *sample) {
+    const control_measurement_t *measured = &state->measurement;
     const protection_input_t input = {
         .current_max_q9 = measured->current_max_q9,
         .dc_link_voltage_q6 = measured->dc_link_voltage_q6,
@@ -46,24 +47,23 @@ static uint64_t protect(const control_parameters_t *parameters, control_state_t 
 
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
-    control_measurement_t *measured = &state->measurement;
     const deferred_results_t *deferred = deferred_in_effect(state);
     measure(parameters, state, deferred, sample);
     if (!state->started) {
-        start(state, measured);
+        start(state);
     }
-    const uint64_t fault_mask = protect(parameters, state, sample, measured) | deferred->fault_mask;
+    const uint64_t fault_mask = protect(parameters, state, sample) | deferred->fault_mask;
     measure_torque(parameters, state, deferred->predictive.misalignment, fault_mask != 0);
-    observe(parameters, state, deferred, measured);
-    const bool run = supervise(parameters, state, sample, command, measured, fault_mask);
+    observe(parameters, state, deferred);
+    const bool run = supervise(parameters, state, sample, command, fault_mask);
     if (run) {
         state->torque_reference_q24 = speed_control_torque_q24(parameters, &state->observer, sample, deferred);
-        torque_control(parameters, state, deferred, measured);
+        torque_control(parameters, state, deferred);
         modulate(state->duty_q15, machine_tables.phases, parameters->period_ticks, parameters->interleaved_pwm,
                  compare);
     } else {
         *compare = (hal_pwm_compare_t){{0}, {0}};
     }
-    deferred_hand_over(parameters, state, sample, command, measured, run);
+    deferred_hand_over(parameters, state, sample, command, run);
     return run;
 }

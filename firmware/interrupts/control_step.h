@@ -193,9 +193,7 @@ typedef struct {
     deferred_request_t deferred_request;
     applied_flux_t applied_flux; /* corrected by the background with the interrupts masked */
     deferred_t deferred;
-    /* Last measurement, for telemetry and background: the steps of the control interrupt receive the measurement as an
-     * argument. */
-    control_measurement_t measurement;
+    control_measurement_t measurement; /* of this period, by measure.h; the background reads the last one */
     observer_slip_t slip;
     uint32_t lost_phase; /* number from 1 on of the phase whose switches stay open, as reported_fault_mask; 0: none */
     int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:

@@ -49,10 +49,9 @@ void deferred_reset_observer(control_state_t *state) {
     request->generation += OBSERVER_STEP;
 }
 
-static void hand_over_bandwidth(control_state_t *state, const control_measurement_t *measured,
-                                deferred_input_t *input) {
+static void hand_over_bandwidth(control_state_t *state, deferred_input_t *input) {
     input->bandwidth.innovation = state->innovation;
-    input->bandwidth.from_edge = measured->angle_from_edge;
+    input->bandwidth.from_edge = state->measurement.angle_from_edge;
     input->bandwidth.stage = state->bandwidth.stage;
     input->bandwidth.trigger = state->bandwidth.trigger;
     state->bandwidth.trigger = OBSERVER_TRIGGER_NONE;
@@ -69,18 +68,18 @@ static void hand_over_pid(bp_pid_t *pid, deferred_input_t *input) {
 }
 
 static void hand_over_predictive(const control_parameters_t *parameters, control_state_t *state,
-                                 const control_measurement_t *measured, deferred_input_t *input) {
+                                 deferred_input_t *input) {
     input->load_torque_q24 = state->observer.load_torque_q24;
     input->speed_correction_q22 = state->observer.speed_correction_q22;
-    input->torque_sum_q24 = measured->torque_sum_q24;
+    input->torque_sum_q24 = state->measurement.torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
     if (parameters->has_bp_pid) {
         hand_over_pid(&state->trim.pid, input);
     }
 }
 
-static void hand_over_duty(const control_parameters_t *parameters, control_state_t *state,
-                           const control_measurement_t *measured, deferred_input_t *input) {
+static void hand_over_duty(const control_parameters_t *parameters, control_state_t *state, deferred_input_t *input) {
+    const control_measurement_t *measured = &state->measurement;
     const unsigned regulated = state->duty.regulated;
     input->regulated_angle = commutation_angle(&parameters->commutation, &measured->commutation, regulated);
     input->regulated_current_q9 = measured->current_q9[regulated];
@@ -88,12 +87,13 @@ static void hand_over_duty(const control_parameters_t *parameters, control_state
 }
 
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                        const command_t *command, const control_measurement_t *measured, bool run) {
+                        const command_t *command, bool run) {
     deferred_request_t *request = &state->deferred_request;
     if (deferred_pending(request, &state->deferred.response)) {
         deferred_skip(request);
         return;
     }
+    const control_measurement_t *measured = &state->measurement;
     deferred_input_t *input = &request->input;
     input->generation = request->generation;
     input->periods = request->skipped + 1;
@@ -107,12 +107,12 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->electrical = measured->commutation.electrical;
     input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
     if (parameters->bandwidth.adaptive) {
-        hand_over_bandwidth(state, measured, input);
+        hand_over_bandwidth(state, input);
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        hand_over_predictive(parameters, state, measured, input);
+        hand_over_predictive(parameters, state, input);
     } else if (parameters->torque_law == TORQUE_LAW_DUTY && state->duty.regulated < HAL_PHASES_MAX) {
-        hand_over_duty(parameters, state, measured, input);
+        hand_over_duty(parameters, state, input);
     }
     deferred_request(request);
 }

@@ -39,7 +39,7 @@ static inline const deferred_results_t *deferred_in_effect(const control_state_t
 
 /* Hands the values of this period over, or counts the period as skipped. run: in state RUN. [control interrupt] */
 void deferred_hand_over(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-                        const command_t *command, const control_measurement_t *measured, bool run);
+                        const command_t *command, bool run);
 
 /* Computes the results of the pending step; deferred_complete() then puts them into effect. The control interrupt may
  * pre-empt both. command: the last accepted one; the background, which alone changes it, waits for the step.

@@ -9,8 +9,8 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDSTILL_Q22 (1u << 21)
 
-static void complete_record(fault_record_t *record, const control_state_t *state, uint32_t time_us,
-                            const control_measurement_t *measured) {
+static void complete_record(fault_record_t *record, const control_state_t *state, uint32_t time_us) {
+    const control_measurement_t *measured = &state->measurement;
     record->time_us = time_us;
     /* The estimate without this sample: the encoder may be the cause of the fault. */
     record->speed_q22 = measured->predicted_speed_q22;
@@ -42,11 +42,11 @@ static void await_load(const control_parameters_t *parameters, control_state_t *
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
  * to be in memory as a whole. */
 NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state, uint32_t time_us,
-                           const control_measurement_t *measured, uint64_t fault_mask, command_request_t request) {
+                           uint64_t fault_mask, command_request_t request) {
     state_machine_t *state_machine = &state->state_machine;
     const drive_state_t before = state_machine->state;
     if (state_machine_stands(state_machine, fault_mask, request, parameters->initialise_ticks)) {
-        complete_record(&state_machine->record, state, time_us, measured);
+        complete_record(&state_machine->record, state, time_us);
     }
     if (before == DRIVE_STATE_RUN) {
         end_run(parameters, state);
@@ -57,7 +57,7 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     } else if (before == DRIVE_STATE_FAULT && state_machine->fault_free_ticks == 1) {
         deferred_reset_run(state); /* not in the period that records the fault, which would take longer than a run */
     } else {
-        observe_recover(state, measured, parameters->initialise_ticks);
+        observe_recover(state, parameters->initialise_ticks);
         if (before != DRIVE_STATE_FAULT) {
             await_load(parameters, state);
         }
@@ -65,7 +65,7 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
 }
 
 bool supervise(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
-               const command_t *command, const control_measurement_t *measured, uint64_t fault_mask) {
+               const command_t *command, uint64_t fault_mask) {
     state_machine_t *state_machine = &state->state_machine;
     const state_machine_input_t input = {
         .fault_mask = fault_mask,
@@ -76,6 +76,6 @@ bool supervise(const control_parameters_t *parameters, control_state_t *state, c
     if (state_machine_runs(state_machine, &input)) { /* entered from READY, which leaves nothing to reset */
         return true;
     }
-    stand(parameters, state, sample->time_us, measured, fault_mask, command->request);
+    stand(parameters, state, sample->time_us, fault_mask, command->request);
     return false;
 }

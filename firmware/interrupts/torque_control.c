@@ -33,22 +33,24 @@ ditc_hysteresis_limit_t torque_control_limit(const control_parameters_t *paramet
 
 /* Torque by which the estimate is below the reference, in units of the tables, in which bands and gains of DITC suit
  * the currents. */
-static int32_t torque_error_q24(const control_state_t *state, const control_measurement_t *measured) {
-    return table_scale_multiply(fixed_subtract(state->torque_reference_q24, measured->torque_sum_q24),
+static int32_t torque_error_q24(const control_state_t *state) {
+    return table_scale_multiply(fixed_subtract(state->torque_reference_q24, state->measurement.torque_sum_q24),
                                 state->table_scale.inverse_excess_q31);
 }
 
 static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
-                               const deferred_results_t *deferred, const control_measurement_t *measured) {
+                               const deferred_results_t *deferred) {
+    const control_measurement_t *measured = &state->measurement;
     commutation_t commutation = {.electrical = measured->commutation.electrical};
     commutation_find(&parameters->commutation, &commutation);
-    ditc_hysteresis_step(&parameters->hysteresis, &commutation, torque_error_q24(state, measured), measured->current_q9,
+    ditc_hysteresis_step(&parameters->hysteresis, &commutation, torque_error_q24(state), measured->current_q9,
                          deferred->limit, state->duty_q15);
 }
 
 /* False when hysteresis control is to act instead. */
 static bool duty_control(const control_parameters_t *parameters, control_state_t *state,
-                         const deferred_results_t *deferred, const control_measurement_t *measured) {
+                         const deferred_results_t *deferred) {
+    const control_measurement_t *measured = &state->measurement;
     if (state->duty.regulated == COMMUTATION_NONE && state->torque_reference_q24 <= 0) {
         /* The speed law's first torque acts in the second period: the outgoing phase would count as depleted before. */
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
@@ -64,7 +66,7 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
     const pwm_ditc_sample_t sample = {
         .current_q9 = measured->current_q9,
         .torque = measured->torque,
-        .error_q24 = torque_error_q24(state, measured),
+        .error_q24 = torque_error_q24(state),
         .gain_q24 = deferred->pid_gain_q24,
         .plan = &deferred->duty,
     };
@@ -75,7 +77,8 @@ static bool duty_control(const control_parameters_t *parameters, control_state_t
 }
 
 static void predictive_control(const control_parameters_t *parameters, control_state_t *state,
-                               const deferred_results_t *deferred, const control_measurement_t *measured) {
+                               const deferred_results_t *deferred) {
+    const control_measurement_t *measured = &state->measurement;
     const load_observer_t *observer = &state->observer;
     const uint32_t rotor_poles = parameters->commutation.rotor_poles;
     const bool voltage_limited = state->predictive.torque_shortfall_q24 != 0; /* in the previous period */
@@ -105,14 +108,14 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     predictive_torque_step(&parameters->predictive, &state->predictive, &machine_tables, &sample, state->duty_q15);
 }
 
-void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
-                    const control_measurement_t *measured) {
+void torque_control(const control_parameters_t *parameters, control_state_t *state,
+                    const deferred_results_t *deferred) {
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        predictive_control(parameters, state, deferred, measured);
+        predictive_control(parameters, state, deferred);
         return;
     }
-    if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, deferred, measured)) {
-        hysteresis_control(parameters, state, deferred, measured); /* in one place, so that it is inlined */
+    if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, deferred)) {
+        hysteresis_control(parameters, state, deferred); /* in one place, so that it is inlined */
     }
     const uint32_t lost = state->lost_phase;
     if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */
