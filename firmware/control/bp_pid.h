@@ -14,7 +14,7 @@
 #include "control/bp_network.h"
 
 typedef enum {
-    BP_PID_OFF,     /* no PID: the caller uses hysteresis, or no trim */
+    BP_PID_OFF,     /* no PID: the caller uses hysteresis */
     BP_PID_FIXED,   /* gains at half their scales */
     BP_PID_FROZEN,  /* gains from the network, weights constant */
     BP_PID_LEARNING /* gains from the network, learning online */

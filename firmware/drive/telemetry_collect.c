@@ -111,10 +111,9 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->bp_pid.kd_per_nm = gain_per_Nm_q15(drive, 2);
     telemetry->bp_pid.duty = (control->duty.pid.duty_q23 + (1 << 7)) >> 8;
 
-    telemetry->trim.trim_torque_nm = salient ? units_torque_q8(control->trim.trim_q24) : 0;
-    telemetry->trim.misalignment_deg = units_deviation_q20(misalignment(drive));
-    telemetry->trim.torque_missing_nm = salient ? units_torque_q8(control->predictive.torque_shortfall_q24) : 0;
-    telemetry->trim.observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[control->bandwidth.stage];
+    telemetry->adaptation.misalignment_deg = units_deviation_q20(misalignment(drive));
+    telemetry->adaptation.torque_missing_nm = salient ? units_torque_q8(control->predictive.torque_shortfall_q24) : 0;
+    telemetry->adaptation.observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[control->bandwidth.stage];
 
     telemetry->fault_cause.time_us = record->time_us;
     telemetry->fault_cause.fault = record->fault;

@@ -220,39 +220,17 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, boo
     });
 }
 
-/* The gain of the torque trim is in N m per N m: the PID's output 1 is the limit, its error 1 the error scale. */
-static int32_t trim_scale_q15(const int32_t *values, parameter_index_t gain) {
-    const int64_t scaled_q39 = (int64_t)values[gain] * values[PARAMETER_BP_ERROR_SCALE_NM];
-    return fixed_clamp(fixed_saturate(fixed_divide(scaled_q39, values[PARAMETER_BP_TRIM_LIMIT_NM])), 0, 4 << 15);
-}
-
-/* Parameters of a BP-PID; network, error scale and seed are common to both of them. */
-static bp_pid_parameters_t bp_pid_from(const int32_t *values, parameter_index_t mode, int32_t kp_scale_q15,
-                                       int32_t ki_scale_q15, int32_t kd_scale_q15) {
+static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
+    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
     return (bp_pid_parameters_t){
-        .mode = (bp_pid_mode_t)values[mode],
+        .mode = (bp_pid_mode_t)values[PARAMETER_BP_MODE],
         .seed = (uint32_t)values[PARAMETER_BP_SEED],
-        .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, values[PARAMETER_BP_ERROR_SCALE_NM])),
-        .scale_q28 = {kp_scale_q15 << 13, ki_scale_q15 << 13, kd_scale_q15 << 13},
+        .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, scale_q24)),
+        .scale_q28 = {pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz) << 13,
+                      pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz) << 13,
+                      pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz) << 13},
         .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
                     .momentum_q32 = values[PARAMETER_BP_ALPHA] << 4},
-    };
-}
-
-static bp_pid_parameters_t duty_pid_from(const int32_t *values, uint32_t control_rate_hz) {
-    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
-    return bp_pid_from(values, PARAMETER_BP_MODE,
-                       pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz),
-                       pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz),
-                       pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz));
-}
-
-static torque_trim_parameters_t trim_from(const int32_t *values) {
-    return (torque_trim_parameters_t){
-        .pid = bp_pid_from(values, PARAMETER_BP_TRIM_MODE, trim_scale_q15(values, PARAMETER_BP_TRIM_KP_MAX),
-                           trim_scale_q15(values, PARAMETER_BP_TRIM_KI_MAX),
-                           trim_scale_q15(values, PARAMETER_BP_TRIM_KD_MAX)),
-        .limit_q24 = values[PARAMETER_BP_TRIM_LIMIT_NM],
     };
 }
 
@@ -422,8 +400,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
         .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
         .speed_law = controller.speed_law,
         .torque_law = controller.torque_law,
-        .has_bp_pid = controller.torque_law == TORQUE_LAW_DUTY ||
-                      (controller.torque_law == TORQUE_LAW_PREDICTIVE && values[PARAMETER_BP_TRIM_MODE] != BP_PID_OFF),
         .speed_reference_min_q22 = controller.four_quadrant ? INT32_MIN : 0,
         .interleaved_pwm = controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2,
         .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
@@ -465,7 +441,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
             },
         .duty =
             {
-                .pid = duty_pid_from(values, control_rate_hz),
+                .pid = bp_pid_from(values, control_rate_hz),
                 .current_setpoints =
                     pwm_ditc_setpoints(tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
                 /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
@@ -473,7 +449,6 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                     fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_slew_rate_A_s)),
                 .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
             },
-        .trim = trim_from(values),
         .predictive = predictive_from(values, tables->phases, control_rate_hz),
         .conduction = conduction_from(values, tables, control_rate_hz, torque_min_q24),
         .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
@@ -550,7 +525,6 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
     parameters->speed_pi = tuned->speed_pi;
     parameters->speed_smc = tuned->speed_smc;
     parameters->duty.pid = tuned->duty.pid;
-    parameters->trim.pid = tuned->trim.pid;
     parameters->predictive.flux = tuned->predictive.flux;
     parameters->conduction.gain_per_step_q16 = tuned->conduction.gain_per_step_q16;
     parameters->moving_load = tuned->moving_load;

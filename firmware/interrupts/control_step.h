@@ -38,7 +38,6 @@
 #include "control/table_scale.h"
 #include "control/torque_mode.h"
 #include "control/torque_offset.h"
-#include "control/torque_trim.h"
 #include "hal_adc.h"
 #include "hal_encoder.h"
 #include "hal_pwm.h"
@@ -59,7 +58,7 @@ typedef enum {
 typedef enum {
     TORQUE_LAW_HYSTERESIS, /* DITC by hysteresis */
     TORQUE_LAW_DUTY,       /* DITC with the duty of a BP-PID */
-    TORQUE_LAW_PREDICTIVE  /* torque sharing, predictive flux control, BP-PID trim */
+    TORQUE_LAW_PREDICTIVE  /* torque sharing, predictive flux control */
 } torque_law_t;
 
 /* Constant while the drive runs; derived from the user's parameters by configure_control. Enumerations have 8 bits: the
@@ -90,7 +89,6 @@ typedef struct {
     speed_smc_parameters_t speed_smc;
     ditc_hysteresis_parameters_t hysteresis;
     pwm_ditc_parameters_t duty;
-    torque_trim_parameters_t trim;
     predictive_torque_parameters_t predictive;
     conduction_parameters_t conduction;
     misalignment_parameters_t misalignment;
@@ -106,7 +104,6 @@ typedef struct {
     encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
     int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
     bool scale_by_shaft;          /* and by the acceleration of the shaft, shaft_torque.h */
-    bool has_bp_pid;              /* torque control by duty, or predictive with a trim */
     degraded_parameters_t degraded;
     thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
     temperature_parameters_t temperature;
@@ -188,7 +185,6 @@ typedef struct {
     int32_t torque_reference_q24;     /* 0 outside RUN */
     int32_t duty_q15[HAL_PHASES_MAX]; /* acts from the coming sample on, -32768..32768; outside RUN -32768: off */
     pwm_ditc_t duty;
-    torque_trim_t trim;
     predictive_torque_t predictive;
     deferred_request_t deferred_request;
     applied_flux_t applied_flux; /* corrected by the background with the interrupts masked */

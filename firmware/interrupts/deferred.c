@@ -67,15 +67,11 @@ static void hand_over_pid(bp_pid_t *pid, deferred_input_t *input) {
     pid->sample.learns = false;
 }
 
-static void hand_over_predictive(const control_parameters_t *parameters, control_state_t *state,
-                                 deferred_input_t *input) {
+static void hand_over_predictive(const control_state_t *state, deferred_input_t *input) {
     input->load_torque_q24 = state->observer.load_torque_q24;
     input->speed_correction_q22 = state->observer.speed_correction_q22;
     input->torque_sum_q24 = state->measurement.torque_sum_q24;
     input->torque_shortfall_q24 = state->predictive.torque_shortfall_q24;
-    if (parameters->has_bp_pid) {
-        hand_over_pid(&state->trim.pid, input);
-    }
 }
 
 static void hand_over_duty(const control_parameters_t *parameters, control_state_t *state, deferred_input_t *input) {
@@ -110,7 +106,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
         hand_over_bandwidth(state, input);
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
-        hand_over_predictive(parameters, state, input);
+        hand_over_predictive(state, input);
     } else if (parameters->torque_law == TORQUE_LAW_DUTY && state->duty.regulated < HAL_PHASES_MAX) {
         hand_over_duty(parameters, state, input);
     }
@@ -465,8 +461,7 @@ NOINLINE static void take_turns(const control_parameters_t *parameters, deferred
 /* The network learns while the drive runs, and begins anew with each run. */
 NOINLINE static void tune_pid(const control_parameters_t *parameters, deferred_t *deferred,
                               const deferred_input_t *input, bool reset, deferred_results_t *results) {
-    const bp_pid_parameters_t *pid =
-        parameters->torque_law == TORQUE_LAW_DUTY ? &parameters->duty.pid : &parameters->trim.pid;
+    const bp_pid_parameters_t *pid = &parameters->duty.pid;
     bp_tuner_t *tuner = &deferred->tuner;
     if (reset) {
         bp_tuner_reset(pid, tuner);
@@ -514,7 +509,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     } else if (!reset) { /* a step that resets has done enough */
         take_turns(parameters, deferred, input, state->flux_misalignment);
     }
-    if (parameters->has_bp_pid) {
+    if (parameters->torque_law == TORQUE_LAW_DUTY) {
         tune_pid(parameters, deferred, input, run_reset, results);
     }
     results->observer = deferred->inertia.laws.observer;

@@ -14,7 +14,6 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
         break;
     case TORQUE_LAW_PREDICTIVE:
         predictive_torque_reset(&state->predictive);
-        torque_trim_reset(&state->trim, 0);
         break;
     }
 }
@@ -81,13 +80,9 @@ static void predictive_control(const control_parameters_t *parameters, control_s
     const control_measurement_t *measured = &state->measurement;
     const load_observer_t *observer = &state->observer;
     const uint32_t rotor_poles = parameters->commutation.rotor_poles;
-    const bool voltage_limited = state->predictive.torque_shortfall_q24 != 0; /* in the previous period */
     /* The duties act from one to two periods after the sample: the observer has predicted the first period. */
     const int32_t step = fixed_multiply_high(observer->speed_q22, parameters->observer.angle_step_q32);
     const uint32_t angle_in_two_periods = (uint32_t)(observer->angle_q64 >> 32) + (uint32_t)step;
-    const int32_t trimmed_q24 =
-        torque_trim_step(&parameters->trim, &state->trim, deferred->pid_gain_q24, state->torque_reference_q24,
-                         measured->torque_sum_q24, voltage_limited);
     const table_scale_factors_t *scale = &state->table_scale;
     const conduction_t *conduction =
         conduction_angles(&parameters->conduction, &state->deferred.conduction, deferred->predictive.conduction);
@@ -98,7 +93,8 @@ static void predictive_control(const control_parameters_t *parameters, control_s
         .angle = angle_in_two_periods * rotor_poles,
         .misalignment = deferred->predictive.misalignment,
         .bus_voltage_q6 = measured->dc_link_voltage_q6,
-        .torque_q24 = table_scale_multiply(fixed_add(trimmed_q24, conduction->ripple_q24), scale->inverse_excess_q31),
+        .torque_q24 = table_scale_multiply(fixed_add(state->torque_reference_q24, conduction->ripple_q24),
+                                           scale->inverse_excess_q31),
         .flux_observer = &scale->flux,
         .period_q40 = scale->period_q40,
         .lost_phase = state->lost_phase,

@@ -59,15 +59,15 @@ def test_14_bits_ripple_little_near_ratios_of_counts(after_step, counts):
     ripples, bench = after_step(speed_rpm(counts, 14, 40_000), encoder_bits=14)
     assert max(ripples) < 0.25
     assert 0.003 < max(ripples[2:]) < 0.06
-    bandwidth = bench.telemetry["DRIVE_TRIM.observer_bandwidth_rad_s"].between(LOADED_S + 0.1, WINDOWS_S[-1][1]).value
-    assert max(bandwidth) <= STEADY_RAD_S
+    bandwidth = bench.telemetry["DRIVE_ADAPTATION.observer_bandwidth_rad_s"]
+    assert max(bandwidth.between(LOADED_S + 0.1, WINDOWS_S[-1][1]).value) <= STEADY_RAD_S
 
 
 @pytest.mark.parametrize(("bits", "counts"), [(17, 8.382), (14, 1.382), (12, 0.382)])
 def test_a_load_step_is_no_load_that_moves(after_step, bits, counts):
     """Far from ratios: the bandwidth decays at once, 5 / t from the trigger on."""
     ripples, bench = after_step(speed_rpm(counts, bits, 40_000), encoder_bits=bits)
-    bandwidth = bench.telemetry["DRIVE_TRIM.observer_bandwidth_rad_s"]
+    bandwidth = bench.telemetry["DRIVE_ADAPTATION.observer_bandwidth_rad_s"]
     assert max(bandwidth.between(LOADED_S, LOADED_S + 0.01).value) > 300
     for after_s in (0.02, 0.03, 0.05):
         after = bandwidth.between(LOADED_S + after_s, LOADED_S + 0.4).value

@@ -301,8 +301,7 @@ TUNED = {
     "paper": {"smc_k": 500.0, "smc_epsilon": 0.75, "smc_delta": 0.5, "observer_bandwidth_rad_s": 600.0,
               "bp_kp_max": 0.25, "bp_ki_max": 0.1875, "bp_kd_max": 0.125},
     "salient": {"smc_k": 500.0, "smc_epsilon": 0.75, "smc_delta": 0.5, "observer_steady_rad_s": 400.0,
-                "observer_wake_rad_s": 6000.0, "flux_observer_gain": 0.375, "bp_trim_kp_max": 0.1875,
-                "bp_trim_ki_max": 0.0625, "bp_trim_kd_max": 0.125},
+                "observer_wake_rad_s": 6000.0, "flux_observer_gain": 0.375},
 }
 
 

@@ -270,7 +270,7 @@ def test_observer_bandwidth_stays_narrow_in_steady_state(make_bench, inertia_gai
     bench = make_bench(controller="salient", encoder_bits=encoder_bits)
     bench.rig.inertia_gain = inertia_gain
     loaded_150(2.0)(bench)
-    bandwidth = bench.telemetry["DRIVE_TRIM.observer_bandwidth_rad_s"]
+    bandwidth = bench.telemetry["DRIVE_ADAPTATION.observer_bandwidth_rad_s"]
     assert bandwidth.between(0.0, 0.2).value.max() > 1000  # the load step raised it
     steady = bench.drive.parameters["observer_steady_rad_s"]
     narrow = bandwidth.between(1.0, 2.0).value

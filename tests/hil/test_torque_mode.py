@@ -251,7 +251,7 @@ def test_held_shaft_does_not_change_what_the_drive_has_learned(make_bench):
     bench.rig.encoder_offset_deg = 0.3
     bench.drive.torque_reference_Nm = 8
     bench.run_for(0.5)
-    assert bench.telemetry["DRIVE_TRIM.misalignment_deg"].last == 0
+    assert bench.telemetry["DRIVE_ADAPTATION.misalignment_deg"].last == 0
 
 
 # --- the dynamometer ------------------------------------------------------------------------------------------------

@@ -534,6 +534,6 @@ def test_longest_path_has_the_instructions_of_the_bound():
 
 def test_each_variant_has_facts_of_its_configuration():
     facts = read_facts(FILE)
-    known = {of.configuration for of in worst_case.VARIANTS.values()}
+    known = {of.controller for of in worst_case.VARIANTS.values()}
     named = [one.configurations for one in (*facts.loop, *facts.never, *facts.exclusive, *facts.at_most)]
     assert set().union(*(of for of in named if of is not None)) == known

@@ -305,7 +305,7 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
 
 @pytest.mark.parametrize(("controller", "tuned"), [
     ("traditional", {"speed_kp": 4.0, "observer_bandwidth_rad_s": 600.0}),
-    ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0, "bp_trim_kp_max": 0.2}),
+    ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0}),
 ])
 def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_microsecond(make_bench, controller, tuned):
     bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8)

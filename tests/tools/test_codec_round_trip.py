@@ -326,7 +326,7 @@ def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
     assert [name for name, period in periods.items() if period == fast] == [
         "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS",
     ]  # fmt: skip
-    assert {name for name, period in periods.items() if period == slow} == {"DRIVE_BP_PID", "DRIVE_TRIM"}
+    assert {name for name, period in periods.items() if period == slow} == {"DRIVE_BP_PID", "DRIVE_ADAPTATION"}
     assert {rate for rate, _ in periods.values()} == {0, 1, 2}
 
 

@@ -177,8 +177,8 @@ TEST_F(Parameters, what_can_be_changed_in_a_run_is_a_gain) {
         "controller",          "torque_max_Nm",  "current_limit_A",    "current_trip_A", "bus_over_voltage_V",
         "bus_under_voltage_V", "over_speed_rpm", "command_timeout_ms", "inertia_kg_m2",  "friction_Nm_s",
         "resistance_ohm",      "bp_mode",        "pulses_per_period",  "torque_sharing", "load_source"};
-    const std::set<std::string> tunable = {
-        "speed_kp", "speed_ki", "smc_k", "smc_delta", "observer_bandwidth_rad_s", "bp_trim_ki_max"};
+    const std::set<std::string> tunable = {"speed_kp", "speed_ki", "smc_k", "smc_delta", "observer_bandwidth_rad_s",
+                                           "bp_ki_max"};
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         EXPECT_TRUE(!parameters_tunable(i) || not_tunable.count(TEXTS[i].name) == 0) << TEXTS[i].name;
         EXPECT_TRUE(parameters_tunable(i) || tunable.count(TEXTS[i].name) == 0) << TEXTS[i].name;

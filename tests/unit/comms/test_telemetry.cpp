@@ -158,7 +158,7 @@ TEST_F(Comms, frames_come_at_their_rates) {
     EXPECT_NEAR(bus.count(DRIVE_TORQUE_FRAME_ID), 1003, 1);
     EXPECT_NEAR(bus.count(DRIVE_CURRENTS_FRAME_ID), 1003, 1);
     EXPECT_EQ(bus.count(DRIVE_BP_PID_FRAME_ID), 101u);
-    EXPECT_EQ(bus.count(DRIVE_TRIM_FRAME_ID), 101u);
+    EXPECT_EQ(bus.count(DRIVE_ADAPTATION_FRAME_ID), 101u);
     EXPECT_EQ(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_COMMAND_COUNTERS_FRAME_ID), 11u);
     EXPECT_EQ(bus.count(DRIVE_BUS_COUNTERS_FRAME_ID), 11u);
@@ -193,7 +193,6 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     control.duty.pid.gain_q24[0] = 16384 << 9;
     control.duty.pid.gain_q24[2] = 70000 << 9;
     control.duty.pid.duty_q23 = -32769 * 256;
-    control.trim.trim_q24 = -3 * (1 << 24);
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         control.deferred.misalignment.phase[phase].offset = (1 << 20) * machine_tables.rotor_poles;
     }
@@ -240,12 +239,11 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     EXPECT_EQ(gains.kp_per_nm, 16384);
     EXPECT_EQ(gains.kd_per_nm, 65535);
     EXPECT_EQ(gains.duty, -32768);
-    drive_trim_t trim;
-    drive_trim_unpack(&trim, first(DRIVE_TRIM_FRAME_ID).data, 8);
-    EXPECT_EQ(trim.trim_torque_nm, -768);
-    EXPECT_EQ(trim.misalignment_deg, 256);
-    EXPECT_EQ(trim.torque_missing_nm, 32767);
-    EXPECT_EQ(trim.observer_bandwidth_rad_s, 8000);
+    drive_adaptation_t adaptation;
+    drive_adaptation_unpack(&adaptation, first(DRIVE_ADAPTATION_FRAME_ID).data, 8);
+    EXPECT_EQ(adaptation.misalignment_deg, 256);
+    EXPECT_EQ(adaptation.torque_missing_nm, 32767);
+    EXPECT_EQ(adaptation.observer_bandwidth_rad_s, 8000);
     drive_processor_t processor;
     drive_processor_unpack(&processor, first(DRIVE_PROCESSOR_FRAME_ID).data, 8);
     EXPECT_EQ(processor.used_us, 3000);
@@ -341,7 +339,7 @@ TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
 }
 
 TEST_F(Comms, dropped_frames_are_counted_exactly) {
-    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 TRIM + 9 of the group counters + identity + heartbeat
+    run(100000, 0); // 100 cycles: 400 + 10 BP_PID + 10 ADAPTATION + 9 of the group counters + identity + heartbeat
     const unsigned waiting = unsigned(bus.mailboxes.size()) + comms.telemetry.queue.count;
     EXPECT_EQ(comms.telemetry.dropped + waiting, 432u);
 }
@@ -394,7 +392,7 @@ TEST_F(Comms, periods_follow_the_parameters_from_the_last_frame_on) {
     }
     EXPECT_EQ(fast, (std::vector<int>{0, 4, 8, 12, 16, 20, 27, 34, 41, 48, 55, 61, 62, 63, 64}));
     EXPECT_EQ(bus.count(DRIVE_CURRENTS_FRAME_ID), fast.size());
-    EXPECT_EQ(bus.count(DRIVE_TRIM_FRAME_ID), 3u + 14u); // cycles 0, 10, 20; 23, 26 to 62
+    EXPECT_EQ(bus.count(DRIVE_ADAPTATION_FRAME_ID), 3u + 14u); // cycles 0, 10, 20; 23, 26 to 62
     EXPECT_EQ(comms.telemetry.dropped, 0);
 }
 

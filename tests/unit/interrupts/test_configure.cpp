@@ -221,19 +221,6 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          1.0);
     near("return", c.conduction.retract_step_q30, 1.0 * DEFERRED_CONDUCTION_PERIODS / rate_hz * fixed_point::Q30, 1.0);
 
-    const auto trim_scale = [&](unsigned index) {
-        return std::min(v(index) * scale_Nm / v(PARAMETER_BP_TRIM_LIMIT_NM), 4.0) * fixed_point::Q15;
-    };
-    ASSERT_EQ(int(c.trim.pid.mode), p.values[PARAMETER_BP_TRIM_MODE]);
-    ASSERT_EQ(int32_t(c.trim.pid.seed), p.values[PARAMETER_BP_SEED]);
-    near("trim limit", c.trim.limit_q24, v(PARAMETER_BP_TRIM_LIMIT_NM) * fixed_point::Q24, 0.0);
-    near("trim error", c.trim.pid.error_scale_inverse_q24, fixed_point::Q24 / scale_Nm, 1.0);
-    near("trim kp", c.trim.pid.scale_q28[0] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KP_MAX), 1.0);
-    near("trim ki", c.trim.pid.scale_q28[1] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KI_MAX), 1.0);
-    near("trim kd", c.trim.pid.scale_q28[2] / 8192.0, trim_scale(PARAMETER_BP_TRIM_KD_MAX), 1.0);
-    near("trim eta", c.trim.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * fixed_point::Q15, 1.0);
-    near("trim alpha", c.trim.pid.network.momentum_q32, v(PARAMETER_BP_ALPHA) * fixed_point::Q32, 1.0);
-
     const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / DEFERRED_LEARNING_PERIODS / machine_tables.phases);
     near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);

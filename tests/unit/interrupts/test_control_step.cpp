@@ -48,7 +48,7 @@ struct diagnostics_t {
     int32_t current_q9[HAL_PHASES_MAX], bus_voltage_q6;
     int32_t duty_q15;
     bool voltage_saturated;
-    int32_t trim_torque_q24, torque_missing_q24; // multiples of 2^-8 N m
+    int32_t torque_missing_q24; // multiple of 2^-8 N m
 };
 
 // A drive on a rotor whose speed the test prescribes.
@@ -113,8 +113,7 @@ class Control : public testing::Test {
             .bus_voltage_q6 = int32_t(telemetry.torque.bus_voltage_v),
             .duty_q15 = telemetry.bp_pid.duty,
             .voltage_saturated = telemetry.status.voltage_saturated != 0,
-            .trim_torque_q24 = telemetry.trim.trim_torque_nm * (1 << 16),
-            .torque_missing_q24 = telemetry.trim.torque_missing_nm * (1 << 16),
+            .torque_missing_q24 = telemetry.adaptation.torque_missing_nm * (1 << 16),
         };
         const uint32_t currents[] = {telemetry.currents.current_a_a, telemetry.currents.current_b_a,
                                      telemetry.currents.current_c_a, telemetry.currents.current_d_a};
@@ -640,13 +639,12 @@ TEST_F(SalientControl, without_edges_the_angle_is_the_middle_of_the_count_and_lo
     EXPECT_EQ(diagnostics.angle, middle());
 }
 
-TEST_F(SalientControl, trim_and_missing_torque_are_0_with_the_other_controllers) {
+TEST_F(SalientControl, missing_torque_is_0_with_the_other_controllers) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER}) {
         configure(controller);
         start();
         for (int k = 0; k < 400; k++) {
             step(COMMAND_RUN, 3000.0);
-            ASSERT_EQ(diagnostics.trim_torque_q24, 0);
             ASSERT_EQ(diagnostics.torque_missing_q24, 0);
         }
     }

@@ -51,7 +51,6 @@ inline const char *difference(const control_parameters_t &a, const control_param
     COMPARE(duty.current_limit_q9)
     COMPARE(duty.torque_per_flux_q16)
     COMPARE(duty.duty_per_torque_q44)
-    COMPARE(trim)
     COMPARE(predictive)
     COMPARE(conduction.sharing.overlapping)
     COMPARE(conduction.sharing.stroke)

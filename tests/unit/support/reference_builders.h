@@ -12,7 +12,6 @@ extern "C" {
 #include "control/predictive_torque.h"
 #include "control/speed_pi.h"
 #include "control/torque_sharing.h"
-#include "control/torque_trim.h"
 }
 
 #include "support/reference_models.h"
@@ -136,13 +135,6 @@ inline bp_pid_t model_of(const bp_pid_parameters_t &p) {
     model.scale = {p.scale_q28[0] / Q28, p.scale_q28[1] / Q28, p.scale_q28[2] / Q28};
     model.eta = p.network.learning_rate_q15 / Q15;
     model.alpha = p.network.momentum_q32 / Q32;
-    return model;
-}
-
-inline trim_t model_of(const torque_trim_parameters_t &p) {
-    trim_t model{};
-    model.pid = model_of(p.pid);
-    model.limit_Nm = p.limit_q24 / fixed_point::Q24;
     return model;
 }
 

@@ -519,23 +519,6 @@ struct bp_pid_t {
     }
 };
 
-// Torque trim: the reference plus the output of a BP-PID for the error of the torque due now.
-struct trim_t {
-    bp_pid_t pid;
-    double limit_Nm;
-    std::array<double, 2> reference_Nm{};
-    double trim_Nm = 0.0;
-
-    double step(double reference, double torque, bool voltage_limited) {
-        const double due = reference_Nm[1];
-        reference_Nm = {reference, reference_Nm[0]};
-        if (!voltage_limited) {
-            trim_Nm = limit_Nm * pid.step(due - torque);
-        }
-        return reference + trim_Nm;
-    }
-};
-
 } // namespace reference_model
 
 #endif

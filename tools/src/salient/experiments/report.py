@@ -14,7 +14,7 @@ Metrics = Mapping[str, Mapping[str, float | None]]
 CONTROLLER_DESCRIPTION = {
     "traditional": "PI speed control and three-level hysteresis DITC",
     "paper": "sliding mode speed control, BP-PID duty in DITC",
-    "salient": "sliding mode, torque sharing, predictive flux PWM, BP-PID trim",
+    "salient": "sliding mode, torque sharing, predictive flux PWM",
 }
 EXPERIMENT_TITLE = {
     "start_600": "Start to {start_rpm:g} r/min, no load",

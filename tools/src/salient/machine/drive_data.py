@@ -328,7 +328,6 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "bp_kp_max": (gain, gain_text),
         "bp_ki_max": (0.24 * gain, "0.24 bp_kp_max"),
         "bp_kd_max": (0.4 * gain, "0.4 bp_kp_max"),
-        "bp_trim_limit_Nm": (3.0 / 16.0 * rated_Nm, "3/16 torque_rated_Nm"),
         "inertia_kg_m2": (inertia, "mechanics.inertia_kg_m2"),
         "friction_Nm_s": (machine.friction_Nm_s, "mechanics.friction_Nm_s"),
         "resistance_ohm": (machine.resistance_ohm, "winding.resistance_ohm"),

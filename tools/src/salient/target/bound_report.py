@@ -31,7 +31,7 @@ def bound(variant: str, build: str, section: str = "interrupt") -> Bound | None:
     handler = HANDLERS[section]
     if handler not in elf.symbols() and handler != CONTROL:
         return None
-    return Model(elf, read_facts(), of.configuration, handler).solve()
+    return Model(elf, read_facts(), of.controller, handler).solve()
 
 
 def bounds(build: str) -> dict[str, dict[str, int]]:

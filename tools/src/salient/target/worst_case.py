@@ -46,12 +46,11 @@ from salient.target.isr_profile import IsrProfile, read_profile
 from salient.toml_file import Table, TextFileError, any_number, checked, number, option, read_toml, validate
 
 FOLDER = ROOT / "tests" / "target" / "worst_case"
-NETWORK = "salient_network"
 
 _REQUESTS = ("stop", "off", "clear_fault")
 _WITHOUT_VALUE = ("silence", *_REQUESTS)
 _WITH_VALUE = ("speed_rpm", "torque_Nm", "commands")
-_FIXED_PARAMETERS = ("controller", "bp_mode", "bp_trim_mode")
+_FIXED_PARAMETERS = ("controller", "bp_mode")
 """Parameters that select another controller; the variant determines them."""
 _DURATION_MS = (2.0, 120.0)
 _TIME_STEP_MS = 0.025
@@ -63,23 +62,15 @@ _WORKERS = 2
 
 @dataclass(frozen=True)
 class Variant:
-    """A configuration with a separate worst case. network: the optional network of salient is on; it is off by default
-    and takes as many instructions as that of the paper. label: for tables."""
+    """A configuration with a separate worst case. label: for tables."""
 
     label: str
     controller: str
     machine: str = "saturating"
-    network: bool = False
-
-    @property
-    def configuration(self) -> str:
-        """Name in the facts of the computed bound (bound_facts.py)."""
-        return NETWORK if self.network else self.controller
 
 
 VARIANTS = {
     **{controller: Variant(controller, controller) for controller in CONTROLLERS},
-    NETWORK: Variant("salient with the network", "salient", network=True),
     **{f"{controller}_four_phases": Variant(f"{controller}, four phases", controller, "finite_element")
        for controller in CONTROLLERS},
 }
@@ -231,8 +222,7 @@ def directed(variant: str) -> list[Input]:
     """Hand-written inputs with combinations of rare events. variant: key of VARIANTS."""
     of = VARIANTS[variant]
     reverse_rpm = -400.0 if of.controller == "salient" else 100.0
-    first = [Action(0.0, "parameter.bp_trim_mode", 3.0)] if of.network else []
-    quick = [*first, Action(0.0, "bench.inertia_gain", 0.2), Action(1.0, "speed_rpm", 600.0)]
+    quick = [Action(0.0, "bench.inertia_gain", 0.2), Action(1.0, "speed_rpm", 600.0)]
     lists = {
         "load step": [*quick, Action(40.0, "bench.load_torque_Nm", 8.0)],
         "maximum noise": [*quick, Action(5.0, "bench.current_noise_A", 10.0),
@@ -248,7 +238,7 @@ def directed(variant: str) -> list[Input]:
                              Action(1.0, "speed_rpm", 2000.0)],
         "reversal": [*quick, Action(30.0, "speed_rpm", reverse_rpm), Action(60.0, "speed_rpm", 600.0)],
         "noisy reversal with a torque reserve": [
-            *first, Action(0.0, "bench.inertia_gain", 0.2), Action(0.0, "bench.current_noise_A", 5.0),
+            Action(0.0, "bench.inertia_gain", 0.2), Action(0.0, "bench.current_noise_A", 5.0),
             Action(0.3, "parameter.torque_reserve_Nm", 18.0), Action(1.0, "speed_rpm", 3000.0),
             Action(10.0, "speed_rpm", 5.0 * reverse_rpm), Action(13.0, "bench.flux_linkage_gain", 2.5)],
         "encoder jumps": [*quick, Action(40.0, "bench.encoder_fault", 2.0), Action(45.0, "bench.encoder_fault", 0.0),
@@ -262,8 +252,8 @@ def directed(variant: str) -> list[Input]:
         "parameters while running": [*quick, Action(20.0, "parameter.torque_max_Nm", 40.0),
                                      Action(25.0, "parameter.current_limit_A", 79.0),
                                      Action(30.0, "bench.load_torque_Nm", 20.0)],
-        "misaligned, eccentric": [*first, Action(0.0, "bench.encoder_offset_deg", 3.0),
-                                  Action(0.0, "bench.encoder_eccentricity_deg", 2.0), *quick[len(first):],
+        "misaligned, eccentric": [Action(0.0, "bench.encoder_offset_deg", 3.0),
+                                  Action(0.0, "bench.encoder_eccentricity_deg", 2.0), *quick,
                                   Action(40.0, "bench.load_torque_Nm", 8.0)],
     }
     return [Input(of.machine, of.controller, 1, 7.0, 80.0, tuple(actions)) for actions in lists.values()]

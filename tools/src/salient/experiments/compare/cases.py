@@ -30,7 +30,6 @@ from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
 PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
-NETWORK_PARAMETER = {"paper": "bp_mode", "salient": "bp_trim_mode"}
 RESERVE = {"torque_reserve_Nm": 8.0}
 SWITCHES = {
     "observer fixed": {"observer_waking": 0}, "observer waking": {"observer_waking": 1},
@@ -215,8 +214,7 @@ def _paper_conditions(quick: bool) -> Iterator[Case]:
 
 def _ablation(quick: bool) -> Iterator[Case]:
     tables = {"exact tables": 0.0, "0.2 deg off": 0.2, "0.5 deg off": 0.5}
-    changes = [(controller, f"BP-PID {mode}", {parameter: number})
-               for controller, parameter in NETWORK_PARAMETER.items() for mode, number in NETWORK.items()]
+    changes = [("paper", f"BP-PID {mode}", {"bp_mode": number}) for mode, number in NETWORK.items()]
     changes += [("salient", change, parameters) for change, parameters in SWITCHES.items()]
     for table, offset_deg in list(tables.items())[-1 if quick else 0:]:
         for controller, change, parameters in changes:
