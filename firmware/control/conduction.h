@@ -73,8 +73,8 @@
 #include "control/machine_tables.h"
 #include "control/torque_sharing.h"
 
-/* Of the phases in one half of the electrical revolution: those that move towards the aligned position, and those that
- * move away from it. */
+/* Halves of the electrical revolution: phases that move towards the aligned position, and phases that move away from
+ * it. */
 enum { CONDUCTION_MOTORING, CONDUCTION_BRAKING, CONDUCTION_HALVES };
 
 /* Angles in 2^-32 electrical rev, of a phase mirrored into 2^31 unaligned .. 2^32 aligned. */
@@ -131,49 +131,65 @@ typedef struct {
     uint32_t on;           /* turn-on */
 } conduction_interval_t;
 
-/* Of the pulse for a part of the largest mean torque. */
+/* Pulse for a part of the largest mean torque. */
 typedef struct {
     uint32_t on, end;   /* past the begin of the half, 2^-32 electrical rev */
     int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24 */
-} conduction_part_t;
+} conduction_partial_pulse_t;
 
 /* Window of torque sharing, past the begin of the half, 2^-32 electrical rev. */
 typedef struct {
     uint32_t on, off;
 } conduction_sharing_t;
 
-#define CONDUCTION_STEPS 5   /* of an update */
+/* Steps of an update, in turn, one in each call: an update at once would exceed the instructions that a period has left
+ * for the deferred interrupt. */
+typedef enum {
+    CONDUCTION_LOOK_UP,    /* tables at the present speed and voltage; mean of the torque */
+    CONDUCTION_MOVE,       /* level or part by the law in effect; gain of the speed law */
+    CONDUCTION_CHOOSE_LAW, /* by the present speed; above base speed the pulse for the part */
+    CONDUCTION_POSITIONS,  /* limits of the torque; turn-on, window and ripple by both laws */
+    CONDUCTION_ANGLES,     /* angles of the update, which are then the latest */
+} conduction_step_t;
+
+#define CONDUCTION_STEPS 5
+
+/* The update in progress: what a step leaves for the later ones. Nothing of it outlasts the update. */
+typedef struct {
+    unsigned step; /* the next one, conduction_step_t */
+    conduction_place_t place;
+    conduction_pulse_t pulse;
+    int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
+    int32_t braking_max_q24;
+    uint32_t extension; /* by which a braking pulse begins earlier, 2^-32 electrical rev */
+    conduction_partial_pulse_t partial;
+    conduction_interval_t interval; /* of the half with the torque */
+    int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
+} conduction_update_t;
+
 #define CONDUCTION_INITIAL 2 /* index of no update yet */
 
 typedef struct {
-    unsigned step;
-    conduction_place_t place;
-    conduction_pulse_t pulse;
-    bool braking;             /* torque against the rotation */
-    uint16_t room_q15;        /* of the DC link for braking torque, part of the largest, Q1.15, 0..1 */
-    int32_t motoring_max_q24; /* largest mean torque, by magnitude, N m, Q7.24 */
-    int32_t braking_max_q24;
-    int32_t link_q30;       /* slow part of the braking limit, Q1.30, 0..1 */
+    /* Results. */
+    conduction_t angles[2]; /* of the last two updates */
+    unsigned latest;        /* index of the last, or CONDUCTION_INITIAL */
+    bool single_pulse;      /* the torque pulsates, or a phase turns on before its half */
     int32_t torque_min_q24; /* limits of the torque reference, N m, Q7.24 */
     int32_t torque_max_q24;
-    int32_t gain_excess_q31;      /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
-    int32_t torque_q24;           /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
-    int32_t missing_sum_q21;      /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
-    int32_t above_base_q15;       /* from the base speed to 1.125 of it, Q1.15, 0..1 */
-    int32_t partial_q15;          /* part of the pulses for parts of the largest torque, Q1.15, 0..1 */
-    int32_t advance_q30;          /* of the windows, Q1.30, 0..1 */
-    int32_t trim_q30;             /* of the level, Q1.30, -1..1 */
-    int32_t level_q15;            /* Q1.15, 0..1 */
-    int32_t part_q15;             /* of the largest mean torque, Q1.15, 0..1 */
-    bool single_pulse;            /* the torque pulsates, or a phase turns on before its half */
-    uint16_t way_q15;             /* from a braking pulse to one without a torque, Q1.15, 0..1 */
-    conduction_sharing_t sharing; /* from the tables */
-    conduction_part_t part;
-    conduction_interval_t interval; /* of the half with the torque */
-    int32_t ripple_q24;             /* to add to the magnitude of the torque reference, N m, Q7.24 */
-    conduction_t angles[2];         /* of the last two updates */
-    unsigned latest;                /* index of the last, or CONDUCTION_INITIAL */
-    uint32_t longer;                /* by which a braking pulse begins earlier, 2^-32 electrical rev */
+    int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
+    /* Both laws. */
+    bool braking;            /* torque against the rotation */
+    int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
+    int32_t missing_sum_q21; /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
+    int32_t trim_q30;        /* of the level or the part, Q1.30, -1..1 */
+    int32_t advance_q30;     /* of the windows, Q1.30, 0..1 */
+    int32_t level_q15;       /* Q1.15, 0..1 */
+    int32_t part_q15;        /* of the largest mean torque, below base speed the level, Q1.15, 0..1 */
+    int32_t above_base_q15;  /* from the base speed to 1.125 of it, Q1.15, 0..1 */
+    int32_t partial_q15;     /* the same with single pulses, else 0: weight of the law above base speed */
+    /* Braking torque. */
+    uint16_t room_q15; /* of the DC link for it, part of the largest, Q1.15, 0..1 */
+    int32_t link_q30;  /* slow part of its limit, Q1.30, 0..1 */
 } conduction_state_t;
 
 typedef struct {
@@ -204,14 +220,14 @@ static inline int32_t conduction_braking_q24(const conduction_parameters_t *para
 /* Angles of torque sharing without advance. */
 conduction_t conduction_initial(const torque_sharing_window_t *window);
 
-/* State without an update; the angles of earlier ones are left as they are. */
-static inline void conduction_reset(const conduction_parameters_t *parameters, conduction_state_t *state) {
-    state->step = 0;
+/* State without an update; the angles of earlier ones are left as they are. An update in progress begins again. */
+static inline void conduction_reset(const conduction_parameters_t *parameters, conduction_state_t *state,
+                                    conduction_update_t *update) {
+    update->step = CONDUCTION_LOOK_UP;
     state->torque_min_q24 = parameters->torque_min_q24;
     state->torque_max_q24 = parameters->torque_max_q24;
     state->link_q30 = 1 << 30;
     state->room_q15 = 1 << 15;
-    state->longer = 0;
     state->advance_q30 = 0;
     state->trim_q30 = 0;
     state->level_q15 = 0;
@@ -222,9 +238,9 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* One of the steps of an update, in turn: tables, level, pulse for a part of the torque, window of torque sharing,
- * limits and positions, angles. Products are rounded down; the level to 2^-15, angles of the tables to 2^-24. */
-void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state,
+/* The next step of the update in progress. Products are rounded down; the level to 2^-15, angles of the tables to
+ * 2^-24. */
+void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state, conduction_update_t *update,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 
 /* Angles of the update with an index. */

@@ -151,6 +151,7 @@ typedef struct {
     torque_mode_t torque_mode;
     unsigned turn; /* of the last step, below DEFERRED_COMMON_PERIODS */
     conduction_state_t conduction;
+    conduction_update_t conduction_update; /* in progress */
     stroke_mean_t stroke_mean;
     bool load_constant;               /* in the last stroke_mean_step */
     speed_smc_parameters_t speed_smc; /* in effect: gain by the identified inertia, above base speed smaller */

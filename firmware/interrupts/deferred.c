@@ -118,7 +118,7 @@ NOINLINE static void follow_resets(const control_parameters_t *parameters, defer
                                    const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;
     if ((changed & RUN_MASK) != 0) {
-        conduction_reset(&parameters->conduction, &deferred->conduction);
+        conduction_reset(&parameters->conduction, &deferred->conduction, &deferred->conduction_update);
         deferred->speed_smc = parameters->speed_smc;
         deferred->run = false;
         deferred->mode = DRIVE_MODE_SPEED;
@@ -348,7 +348,8 @@ static void move_conduction(const control_parameters_t *parameters, deferred_t *
                       DEFERRED_CONDUCTION_PERIODS,
         .dc_link_voltage_q6 = input->dc_link_voltage_q6,
     };
-    conduction_step(&parameters->conduction, &deferred->conduction, &machine_tables, &sample);
+    conduction_step(&parameters->conduction, &deferred->conduction, &deferred->conduction_update, &machine_tables,
+                    &sample);
 }
 
 /* Gain by the identified inertia; above base speed gain and epsilon by the same factor smaller: far from the reference

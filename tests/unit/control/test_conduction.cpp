@@ -263,12 +263,14 @@ struct model_t {
 
 class Conduction : public testing::Test {
   protected:
-    Conduction() : tables(tables_of()), parameters(parameters_of()) { conduction_reset(&parameters, &state); }
+    Conduction() : tables(tables_of()), parameters(parameters_of()) {
+        conduction_reset(&parameters, &state, &progress);
+    }
 
     void update(const sample_t &s) {
         const conduction_sample_t sample = fixed(s);
         for (unsigned step = 0; step < CONDUCTION_STEPS; step++) {
-            conduction_step(&parameters, &state, &tables, &sample);
+            conduction_step(&parameters, &state, &progress, &tables, &sample);
         }
     }
 
@@ -305,6 +307,7 @@ class Conduction : public testing::Test {
     machine_tables_t tables;
     conduction_parameters_t parameters;
     conduction_state_t state{};
+    conduction_update_t progress{};
 };
 
 TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages) {
@@ -317,7 +320,7 @@ TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages
             for (const double of_last : {0.0, 0.2, 0.41, 0.5, 0.75, 1.0, 1.4}) {
                 for (const double voltage : {160.0, 240.0, 288.0, 296.0, 310.0}) {
                     for (const double torque : {0.0, 5.0, 14.0, 18.0, 22.0, 38.0}) {
-                        conduction_reset(&parameters, &state);
+                        conduction_reset(&parameters, &state, &progress);
                         model_t model{tables};
                         model.longer = parameters.longer_pulses > 0;
                         model.own_windows = parameters.own_windows;
@@ -331,7 +334,7 @@ TEST_F(Conduction, equals_its_model_in_every_quadrant_at_all_speeds_and_voltages
                         compare(model, std::to_string(sign * torque) + " N m, " + std::to_string(speed) + " rad/s, " +
                                            std::to_string(voltage) + " V");
                         ++(state.level_q15 == 0 ? sharing : state.level_q15 < 32768 ? blended : full);
-                        longer += model.braking && model.partial > 0.0 && state.longer > 0;
+                        longer += model.braking && model.partial > 0.0 && progress.extension > 0;
                     }
                 }
             }
@@ -367,7 +370,7 @@ TEST_F(Conduction, is_the_same_in_both_directions_but_for_signs) {
         update(ahead);
     }
     forward = state;
-    conduction_reset(&parameters, &state);
+    conduction_reset(&parameters, &state, &progress);
     for (unsigned k = 0; k < 30; k++) {
         update(back);
     }
@@ -465,11 +468,11 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
             tables.pulse_base_index = uint16_t(1 + random() % 4096);
             tables.pulse_index_scale = random() >> 1;
             parameters.longer_pulses = k % 200 == 0 ? 3 : 0;
-            conduction_reset(&parameters, &state);
+            conduction_reset(&parameters, &state, &progress);
         }
         const conduction_sample_t sample{any(), any(), any(), any(), uint32_t(random()), any() >> 15};
         for (unsigned step = 0; step < CONDUCTION_STEPS; step++) {
-            conduction_step(&parameters, &state, &tables, &sample);
+            conduction_step(&parameters, &state, &progress, &tables, &sample);
         }
         ASSERT_GE(state.level_q15, 0);
         ASSERT_LE(state.level_q15, 32768);
@@ -478,8 +481,7 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
         ASSERT_GE(state.link_q30, 0);
         ASSERT_LE(state.link_q30, 1 << 30);
         ASSERT_LE(state.room_q15, 32768);
-        ASSERT_LE(state.way_q15, parameters.longer_pulses > 0 ? 32768 : 0);
-        ASSERT_LT(state.longer, 1u << 31);
+        ASSERT_LT(progress.extension, parameters.longer_pulses > 0 ? 1u << 31 : 1u);
         ASSERT_GE(state.gain_excess_q31, 0);
         ASSERT_LE(state.torque_min_q24, 0);
         ASSERT_GE(state.torque_min_q24, parameters.torque_min_q24);

@@ -106,7 +106,7 @@ class Machine {
     explicit Machine(const torque_parameters_t &p)
         : parameters(p), model(reference_model::model_of(p, p.conduction, &TABLES, PHASES)), conduction() {
         predictive_torque_reset(&control);
-        conduction_reset(&p.conduction, &conduction);
+        conduction_reset(&p.conduction, &conduction, &update);
     }
 
     // One period at a speed in electrical revolutions per period and a torque reference: duties of firmware and model.
@@ -157,7 +157,7 @@ class Machine {
                                            .angle_step = 0,
                                            .dc_link_voltage_q6 = int32_t(BUS_V * Q6)};
         for (int step = 0; step < CONDUCTION_STEPS; step++) {
-            conduction_step(&parameters.conduction, &conduction, &machine_tables, &moves);
+            conduction_step(&parameters.conduction, &conduction, &update, &machine_tables, &moves);
         }
         const predictive_torque_sample_t sample = {
             .current_q9 = current_q9,
@@ -194,6 +194,7 @@ class Machine {
     predictive_torque_t control;
     reference_model::predictive_t<tables_t> model;
     conduction_state_t conduction;
+    conduction_update_t update{};
     int32_t duty_q15[HAL_PHASES_MAX] = {};
     double flux[PHASES] = {}, acting[PHASES] = {};
     // Estimates of the last sample, of the phases with current.
@@ -636,7 +637,8 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
         p.current_limit_q9 = int32_t(random() % (79 * 512)) + 512;
         predictive_torque_t control{};
         conduction_state_t conduction{};
-        conduction_reset(&p.conduction, &conduction);
+        conduction_update_t update{};
+        conduction_reset(&p.conduction, &conduction, &update);
         p.conduction.single_pulse = i % 2 == 0;
         int32_t current_q9[HAL_PHASES_MAX], flux[HAL_PHASES_MAX], misalignment[HAL_PHASES_MAX];
         int32_t duty_q15[HAL_PHASES_MAX];
@@ -658,7 +660,7 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
                                                .angle_step = random_angle_step(random),
                                                .dc_link_voltage_q6 = voltages[random() % 4]};
             for (int step = 0; step < CONDUCTION_STEPS; step++) {
-                conduction_step(&p.conduction, &conduction, &machine_tables, &moves);
+                conduction_step(&p.conduction, &conduction, &update, &machine_tables, &moves);
             }
             const predictive_torque_sample_t sample = {
                 .current_q9 = current_q9,

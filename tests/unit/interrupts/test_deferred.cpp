@@ -137,7 +137,7 @@ TEST_F(Deferred, results_take_effect_together_at_the_end_of_the_step) {
         period(COMMAND_RUN, 3000.0); // a torque shortfall: the windows move
     }
     while (state.deferred.turn % DEFERRED_SLOW_PERIODS != 1 ||
-           state.deferred.conduction.step != CONDUCTION_STEPS - 1) { // in the next step
+           state.deferred.conduction_update.step != CONDUCTION_STEPS - 1) { // in the next step
         period(COMMAND_RUN, 3000.0);
     }
     interrupt(COMMAND_RUN, 3000.0);
