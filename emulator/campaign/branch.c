@@ -11,11 +11,9 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "campaign/seeded.h"
+#include "campaign/drive_numbers.h"
 #include "fault_kinds.h"
 #include "rig/faults.h"
-
-enum { STATE_RUN = 2 };
 
 #define SLOW_TICKS 50                      /* a slow fault begins at every 50th tick, */
 #define SLOW_POSITIONS 10                  /* or at every tenth position */
@@ -130,24 +128,25 @@ static struct {
 static void finish_child(run_t *run) {
     tally_t *tally = branching.tally;
     tally->branches++;
-    if (!branching.reaction_ns && run->oracle.dark_ns && run->drive->view().state != STATE_RUN) {
-        branching.reaction_ns = run->oracle.dark_ns; /* reset by the watchdog, long after the gates were off */
+    if (!branching.reaction_ns && run->checkers.seen.dark_ns && run->drive->view().state != STATE_RUN) {
+        branching.reaction_ns = run->checkers.seen.dark_ns; /* reset by the watchdog, long after the gates were off */
     }
     tally->virtual_ns += run->rig.board.time_ns - branching.begin_ns;
     if (branching.reaction_ns) {
         const uint64_t took_ns =
             branching.reaction_ns > branching.begin_ns ? branching.reaction_ns - branching.begin_ns : 0;
         tally->detected++;
-        tally->causes |= UINT64_C(1) << (run->oracle.causes ? run->oracle.cause[0] : run->drive->view().fault);
+        tally->causes |=
+            UINT64_C(1) << (run->checkers.seen.causes ? run->checkers.seen.cause[0] : run->drive->view().fault);
         if (took_ns >= tally->longest_ns) {
             tally->longest_ns = took_ns;
             tally->longest_tick = branching.tick;
         }
     }
-    if (run->oracle.violations) {
+    if (run->checkers.violations) {
         if (tally->violations++ == 0) {
-            snprintf(tally->rule, sizeof tally->rule, "%s %u", run->oracle.violation[0].rule,
-                     run->oracle.violation[0].number);
+            snprintf(tally->rule, sizeof tally->rule, "%s %u", run->checkers.violation[0].rule,
+                     run->checkers.violation[0].number);
             tally->violation_tick = branching.tick;
         }
     }
@@ -156,8 +155,8 @@ static void finish_child(run_t *run) {
 
 static void before_interrupt_of_child(run_t *run) {
     const uint64_t now_ns = run->rig.board.time_ns;
-    if (!branching.reaction_ns && run->oracle.causes) {
-        branching.reaction_ns = run->oracle.cause_us * 1000;
+    if (!branching.reaction_ns && run->checkers.seen.causes) {
+        branching.reaction_ns = run->checkers.seen.cause_us * 1000;
     }
     const bool watched = now_ns > branching.reaction_ns + AFTER_NS && now_ns >= branching.watched_until_ns;
     if ((branching.reaction_ns && watched) || now_ns >= run->end_ns) {

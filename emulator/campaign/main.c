@@ -43,16 +43,16 @@ static bool start(const world_t *of, board_t *board, rig_firmware_t *firmware) {
            host_drive_start(&host, board, &config, firmware);
 }
 
-static oracle_drive_t view(void) {
+static observation_drive_t view(void) {
     const state_machine_t *state_machine = &host.drive.control.state_machine;
     const control_measurement_t *measured = &host.drive.control.measurement;
-    oracle_drive_t seen = {.state = (uint8_t)state_machine->state,
-                           .fault = (uint8_t)state_machine->record.fault,
-                           .checks = (uint32_t)state_machine->record.fault_mask,
-                           .angle = measured->angle,
-                           .heat = {temperature_C(&host.drive.temperature, TEMPERATURE_WINDING),
-                                    temperature_C(&host.drive.temperature, TEMPERATURE_INVERTER)},
-                           .link_voltage = (double)measured->dc_link_voltage_q6 / machine_tables.voltage_range_q6};
+    observation_drive_t seen = {.state = (uint8_t)state_machine->state,
+                                .fault = (uint8_t)state_machine->record.fault,
+                                .checks = (uint32_t)state_machine->record.fault_mask,
+                                .angle = measured->angle,
+                                .heat = {temperature_C(&host.drive.temperature, TEMPERATURE_WINDING),
+                                         temperature_C(&host.drive.temperature, TEMPERATURE_INVERTER)},
+                                .link_voltage = (double)measured->dc_link_voltage_q6 / machine_tables.voltage_range_q6};
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         seen.current[phase] = (double)measured->current_q9[phase] / machine_tables.current_range_q9;
     }
@@ -100,25 +100,26 @@ static bool read_machines(const char *path) {
 /* --- One seed --- */
 
 static void print_result(void) {
-    const oracle_t *oracle = &run.oracle;
+    const checkers_t *checkers = &run.checkers;
+    const observation_t *seen = &checkers->seen;
     printf("{\"seed\": %" PRIu64 ", \"hash\": \"%016" PRIx64 "\", \"machine\": %u, \"controller\": %u, \"virtual_us\": "
            "%" PRIu64 ", \"causes\": [",
            world.seed, run.sender.hash, (unsigned)(world.machine - machines), world.controller,
            run.rig.board.time_ns / 1000);
-    for (unsigned i = 0; i < oracle->causes; i++) {
-        printf("%s%u", i ? ", " : "", oracle->cause[i]);
+    for (unsigned i = 0; i < seen->causes; i++) {
+        printf("%s%u", i ? ", " : "", seen->cause[i]);
     }
-    printf("], \"recovered\": %s, \"held\": %s, \"violations\": [", oracle->settled ? "true" : "false",
-           oracle->held ? "true" : "false");
-    for (unsigned i = 0; i < oracle->violations; i++) {
-        const oracle_violation_t *violation = &oracle->violation[i];
+    printf("], \"recovered\": %s, \"held\": %s, \"violations\": [", seen->recovery.settled ? "true" : "false",
+           seen->recovery.held ? "true" : "false");
+    for (unsigned i = 0; i < checkers->violations; i++) {
+        const checkers_violation_t *violation = &checkers->violation[i];
         printf("%s{\"rule\": \"%s\", \"number\": %u, \"at_us\": %" PRIu64 ", \"value\": %.6g}", i ? ", " : "",
                violation->rule, violation->number, violation->time_us, violation->value);
     }
     printf("], \"cells\": [");
     const char *separator = "";
-    for (unsigned cell = 0; cell < ORACLE_CELLS; cell++) {
-        if ((unsigned)oracle->cell[cell / 8] >> cell % 8 & 1u) {
+    for (unsigned cell = 0; cell < CHECKERS_CELLS; cell++) {
+        if ((unsigned)checkers->cell[cell / 8] >> cell % 8 & 1u) {
             printf("%s%u", separator, cell);
             separator = ", ";
         }

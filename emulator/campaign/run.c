@@ -3,7 +3,8 @@
 #include "rig/heat.h"
 
 static void look(void *context, const plant_t *plant) {
-    oracle_look(&((run_t *)context)->oracle, plant);
+    (void)plant;
+    checkers_on_look(&((run_t *)context)->checkers);
 }
 
 static void before_interrupt(void *context) {
@@ -15,31 +16,25 @@ static void before_interrupt(void *context) {
 
 static void after_interrupt(void *context) {
     run_t *run = context;
-    oracle_after_interrupt(&run->oracle, &run->rig.plant, run->drive->view());
+    checkers_on_interrupt(&run->checkers, run->drive->view());
 }
 
 static void after_restart(void *context) {
     run_t *run = context;
-    oracle_reset(&run->oracle, run->rig.board.time_ns, run->drive->view());
+    checkers_on_reset(&run->checkers, run->rig.board.time_ns, run->drive->view());
 }
 
-static void on_bus(void *context, uint64_t time_ns, const sender_meaning_t *meaning) {
-    run_t *run = context;
-    oracle_on_bus(&run->oracle, &run->rig.plant, time_ns, meaning);
+static void on_command(void *context, uint64_t time_ns, const sender_meaning_t *meaning) {
+    checkers_on_command(&((run_t *)context)->checkers, time_ns, meaning);
 }
 
-static void on_status(void *context, uint64_t time_ns, unsigned state, unsigned fault) {
-    oracle_on_status(&((run_t *)context)->oracle, time_ns, state, fault);
-}
-
-static void on_telemetry(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
-    oracle_on_telemetry(&((run_t *)context)->oracle, time_ns, identifier, data);
+static void on_frame(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
+    checkers_on_frame(&((run_t *)context)->checkers, time_ns, identifier, data);
 }
 
 static void on_fault(void *context, uint64_t time_ns, unsigned kind, bool begins) {
-    run_t *run = context;
     (void)time_ns;
-    oracle_on_fault(&run->oracle, &run->rig.plant, kind, begins);
+    checkers_on_fault(&((run_t *)context)->checkers, kind, begins);
 }
 
 bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE *record) {
@@ -49,9 +44,8 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     run->end_ns = world->duration_us * 1000;
     sender_init(&run->sender, world, drive->parameters);
     run->sender.record = record;
-    run->sender.on_bus = on_bus;
-    run->sender.on_status = on_status;
-    run->sender.on_telemetry = on_telemetry;
+    run->sender.on_command = on_command;
+    run->sender.on_frame = on_frame;
     run->sender.on_fault = on_fault;
     run->sender.context = run;
     rig_config_t config = {
@@ -69,15 +63,15 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
     pacing_parse(&config.pacing, "lockstep");
     rig_init(&run->rig, &config);
     rig_firmware_t firmware;
-    if (!drive->start(world, &run->rig.board, &firmware)) {
+    if (!drive->start(world, &run->rig.board, &firmware) ||
+        !checkers_start(&run->checkers, world, &run->rig.plant, 1000000000u / world->control_rate_hz)) {
         return false;
     }
+    run->checkers.seen.limit_bits = drive->limit_bits;
+    run->checkers.seen.constant_bits = drive->constant_bits;
     run->rig.observer = (rig_observer_t){before_interrupt, after_interrupt, after_restart, run};
-    oracle_init(&run->oracle, world, &run->rig.plant, 1000000000u / world->control_rate_hz);
-    run->oracle.limit_bits = drive->limit_bits;
-    run->oracle.constant_bits = drive->constant_bits;
     rig_join(&run->rig, &firmware);
-    plant_observe(&run->rig.plant, ORACLE_LOOK_NS / 2, ORACLE_LOOK_NS, look, run);
+    plant_observe(&run->rig.plant, OBSERVATION_LOOK_NS / 2, OBSERVATION_LOOK_NS, look, run);
     return true;
 }
 
@@ -87,17 +81,17 @@ void run_to_end(run_t *run) {
     while (run->rig.board.time_ns < run->end_ns) {
         if (recovers && run->rig.board.time_ns >= recovery_ns) {
             recovers = false;
-            sender_set_recovery_speed(&run->sender, oracle_recovery_speed_rpm(&run->oracle, &run->rig.plant));
+            sender_set_recovery_speed(&run->sender, observation_recovery_speed_rpm(&run->checkers.seen));
         }
         if (!rig_serve(&run->rig, 0)) {
             break;
         }
-        if (run->oracle.settled) { /* nothing left to be judged */
+        if (run->checkers.seen.recovery.settled) { /* nothing left to be judged */
             run->end_ns = run->rig.board.time_ns;
         }
     }
     rig_finish(&run->rig);
-    oracle_finish(&run->oracle, &run->rig.plant,
-                  (oracle_heat_t){heat_winding_C(&run->rig.heat), heat_inverter_C(&run->rig.heat)});
+    checkers_at_end(&run->checkers,
+                    (observation_heat_t){heat_winding_C(&run->rig.heat), heat_inverter_C(&run->rig.heat)});
     rig_close(&run->rig);
 }

@@ -1,8 +1,8 @@
-/* A world in one process: rig, clients, oracle, and the drive by the functions of run_drive_t. One at a time. */
+/* A world in one process: rig, clients, checkers, and the drive by the functions of run_drive_t. One at a time. */
 #ifndef CAMPAIGN_RUN_H
 #define CAMPAIGN_RUN_H
 
-#include "campaign/oracle.h"
+#include "campaign/checkers/checkers.h"
 #include "campaign/sender.h"
 #include "campaign/world.h"
 #include "rig/rig.h"
@@ -10,7 +10,7 @@
 /* The drive. start: from reset, with the machine of the world; false when it rejects the configuration. */
 typedef struct {
     bool (*start)(const world_t *world, board_t *board, rig_firmware_t *firmware);
-    oracle_drive_t (*view)(void);
+    observation_drive_t (*view)(void);
     sender_parameters_t parameters;
     uint32_t limit_bits, constant_bits; /* that a change of memory finds there */
 } run_drive_t;
@@ -18,7 +18,7 @@ typedef struct {
 typedef struct run {
     rig_t rig;
     sender_t sender;
-    oracle_t oracle;
+    checkers_t checkers;
     const world_t *world;
     const run_drive_t *drive;
     uint64_t end_ns;                           /* may be moved while it runs */

@@ -6,8 +6,8 @@
 #include <string.h>
 
 #include "bench_variables.h"
+#include "campaign/drive_numbers.h"
 #include "campaign/seeded.h"
-#include "drive_codec.h"
 #include "rig_codec.h"
 
 #define HASH_START UINT64_C(14695981039346656037)
@@ -22,18 +22,6 @@
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 #define STREAM_HOSTILE 200
 
-/* E2EDataId of drive.dbc. */
-enum {
-    DATA_ID_COMMAND = 23070,
-    DATA_ID_TORQUE_COMMAND,
-    DATA_ID_ARM,
-    DATA_ID_PARAMETER_WRITE,
-    DATA_ID_PARAMETER_SET_CONTROL
-};
-enum { ARM_REQUEST_RUN, ARM_CONFIRM_RUN, ARM_REQUEST_CONFIGURATION, ARM_CONFIRM_CONFIGURATION };
-enum { ATTEMPT_RUN = 1, ATTEMPT_CONFIGURATION };
-enum { SET_BEGIN = 0, SET_APPLY = 2, SET_SAVE = 4 };
-enum { STATE_INITIALISE, STATE_READY, STATE_RUN, STATE_FAULT };
 enum { HONEST = 1, OTHER = 2 };
 
 static void mix(sender_t *sender, const void *bytes, size_t count) {
@@ -109,7 +97,7 @@ static void put_command(sender_t *sender, const transport_receiver_t *receiver, 
     for (unsigned i = 0; i < 3; i++) {
         data[4 + i] = (uint8_t)((uint32_t)reference >> 8 * i);
     }
-    protect(data, sizeof data, torque_mode ? DATA_ID_TORQUE_COMMAND : DATA_ID_COMMAND, counter);
+    protect(data, sizeof data, torque_mode ? DRIVE_TORQUE_COMMAND_E2E_DATA_ID : DRIVE_COMMAND_E2E_DATA_ID, counter);
     put_genuine(sender, receiver, client, torque_mode ? DRIVE_TORQUE_COMMAND_FRAME_ID : DRIVE_COMMAND_FRAME_ID, data,
                 sizeof data);
 }
@@ -119,7 +107,7 @@ static void put_arm(sender_t *sender, const transport_receiver_t *receiver, unsi
     for (unsigned i = 0; i < 4; i++) {
         data[4 + i] = (uint8_t)(response >> 8 * i);
     }
-    protect(data, sizeof data, DATA_ID_ARM, sender->arm_counter++);
+    protect(data, sizeof data, DRIVE_ARM_E2E_DATA_ID, sender->arm_counter++);
     put_genuine(sender, receiver, HONEST, DRIVE_ARM_FRAME_ID, data, sizeof data);
 }
 
@@ -165,7 +153,7 @@ static void put_events(sender_t *sender, const transport_receiver_t *receiver) {
     const world_t *world = sender->world;
     for (unsigned i = 0; i < world->events; i++) {
         const world_event_t *event = world_begun(world, i, UINT64_MAX);
-        if (event == NULL || event->kind > WORLD_FAULT) {
+        if (event == NULL || (event->kind != WORLD_SET && event->kind != WORLD_FAULT)) {
             continue;
         }
         for (unsigned end = 0; end < 2; end++) {
@@ -267,10 +255,11 @@ static bool configures(const sender_t *sender) {
 
 static void put_one_parameter(sender_t *sender, const transport_receiver_t *receiver, unsigned index, uint32_t value,
                               uint32_t error) {
-    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_BEGIN, 0);
-    put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DATA_ID_PARAMETER_WRITE, (uint8_t)index, value);
-    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_APPLY,
-            check_of_set((uint8_t)index, value) ^ error);
+    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_E2E_DATA_ID,
+            DRIVE_PARAMETER_SET_CONTROL_STEP_BEGIN_CHOICE, 0);
+    put_set(sender, receiver, DRIVE_PARAMETER_WRITE_FRAME_ID, DRIVE_PARAMETER_WRITE_E2E_DATA_ID, (uint8_t)index, value);
+    put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_E2E_DATA_ID,
+            DRIVE_PARAMETER_SET_CONTROL_STEP_APPLY_CHOICE, check_of_set((uint8_t)index, value) ^ error);
 }
 
 static void put_session(sender_t *sender, const transport_receiver_t *receiver) {
@@ -284,7 +273,8 @@ static void put_session(sender_t *sender, const transport_receiver_t *receiver) 
         break;
     }
     case SESSION_SAVE:
-        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DATA_ID_PARAMETER_SET_CONTROL, SET_SAVE, 0);
+        put_set(sender, receiver, DRIVE_PARAMETER_SET_CONTROL_FRAME_ID, DRIVE_PARAMETER_SET_CONTROL_E2E_DATA_ID,
+                DRIVE_PARAMETER_SET_CONTROL_STEP_SAVE_CHOICE, 0);
         sender->resting_us = sender->time_us + SAVING_US;
         break;
     default: {
@@ -300,14 +290,14 @@ static void configure(sender_t *sender, const transport_receiver_t *receiver) {
     if (sender->time_us < sender->resting_us) {
         return;
     }
-    if (sender->challenge && sender->challenge_for == ATTEMPT_CONFIGURATION) {
-        put_arm(sender, receiver, ARM_CONFIRM_CONFIGURATION, ~sender->challenge);
+    if (sender->challenge && sender->challenge_for == DRIVE_ARMING_ATTEMPT_CONFIGURATION_CHOICE) {
+        put_arm(sender, receiver, DRIVE_ARM_STEP_CONFIRM_CONFIGURATION_CHOICE, ~sender->challenge);
         put_session(sender, receiver);
         sender->challenge = 0;
         sender->configured++;
     } else if (sender->state == STATE_READY && sender->time_us >= sender->requested_us + ARM_RETRY_US) {
         sender->requested_us = sender->time_us;
-        put_arm(sender, receiver, ARM_REQUEST_CONFIGURATION, 0);
+        put_arm(sender, receiver, DRIVE_ARM_STEP_REQUEST_CONFIGURATION_CHOICE, 0);
     }
 }
 
@@ -347,12 +337,12 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
         sender->state == STATE_INITIALISE) {
         return;
     }
-    if (sender->challenge && sender->challenge_for == ATTEMPT_RUN) {
-        put_arm(sender, receiver, ARM_CONFIRM_RUN, ~sender->challenge);
+    if (sender->challenge && sender->challenge_for == DRIVE_ARMING_ATTEMPT_RUN_CHOICE) {
+        put_arm(sender, receiver, DRIVE_ARM_STEP_CONFIRM_RUN_CHOICE, ~sender->challenge);
         sender->challenge = 0;
     } else if (sender->time_us >= sender->requested_us + ARM_RETRY_US) {
         sender->requested_us = sender->time_us;
-        put_arm(sender, receiver, ARM_REQUEST_RUN, 0);
+        put_arm(sender, receiver, DRIVE_ARM_STEP_REQUEST_RUN_CHOICE, 0);
     }
 }
 
@@ -387,7 +377,7 @@ static void put_repeated(sender_t *sender, const transport_receiver_t *receiver)
 /* A command of any kind with the next counter, its checksum off by a bit. */
 static void put_forged(sender_t *sender, const transport_receiver_t *receiver) {
     uint8_t data[7] = {[3] = (uint8_t)(draw(sender) % 4)};
-    protect(data, sizeof data, DATA_ID_COMMAND, sender->counter);
+    protect(data, sizeof data, DRIVE_COMMAND_E2E_DATA_ID, sender->counter);
     data[0] ^= (uint8_t)(1u << draw(sender) % 8);
     put(sender, receiver, OTHER, DRIVE_COMMAND_FRAME_ID, data, sizeof data);
 }
@@ -476,7 +466,8 @@ static sender_meaning_t meaning_of_genuine(const sender_t *sender, const sender_
     return (sender_meaning_t){.genuine = frame->in_sequence && !beyond,
                               .other = frame->other,
                               .command = is_motion_command(frame->identifier),
-                              .confirms = frame->identifier == DRIVE_ARM_FRAME_ID && frame->data[3] == ARM_CONFIRM_RUN,
+                              .confirms = frame->identifier == DRIVE_ARM_FRAME_ID &&
+                                          frame->data[3] == DRIVE_ARM_STEP_CONFIRM_RUN_CHOICE,
                               .torque = torque,
                               .request = (sender_request_t)frame->data[3],
                               .reference = (double)((int32_t)(raw ^ 0x800000u) - 0x800000) * lsb};
@@ -496,19 +487,23 @@ static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_
     return (sender_meaning_t){.genuine = false};
 }
 
+/* A frame of the drive; all that concern the client have eight bytes. */
 static void listen(sender_t *sender, const struct can_frame *frame, uint64_t time_ns) {
-    if (frame->can_id == DRIVE_STATUS_FRAME_ID && frame->len == 8) {
-        sender->state = frame->data[4] & 0x0F;
-        sender->on_status(sender->context, time_ns, sender->state, frame->data[5]);
-    } else if (frame->can_id == DRIVE_ARMING_FRAME_ID && frame->len == 8) {
-        uint32_t challenge;
-        memcpy(&challenge, frame->data, sizeof challenge);
-        sender->armed = frame->data[4] >> 2 & 1u;
-        sender->challenge_for = frame->data[4] & 3u;
-        sender->challenge = challenge;
-    } else if (frame->len == 8) {
-        sender->on_telemetry(sender->context, time_ns, frame->can_id, frame->data);
+    if (frame->len != 8) {
+        return;
     }
+    if (frame->can_id == DRIVE_STATUS_FRAME_ID) {
+        struct drive_status_t status;
+        drive_status_unpack(&status, frame->data, 8);
+        sender->state = status.state;
+    } else if (frame->can_id == DRIVE_ARMING_FRAME_ID) {
+        struct drive_arming_t arming;
+        drive_arming_unpack(&arming, frame->data, 8);
+        sender->armed = arming.armed;
+        sender->challenge_for = arming.attempt;
+        sender->challenge = arming.challenge;
+    }
+    sender->on_frame(sender->context, time_ns, frame->can_id, frame->data);
 }
 
 /* What is on the bus, and the true state: not the answers of the bench, which depend on how a client divides time. */
@@ -534,7 +529,7 @@ static void send_clients(transport_t *transport, uint64_t time_ns, transport_ori
     mix(sender, frame->classic.data, frame->classic.len);
     if (origin == TRANSPORT_FROM_CLIENT_ON_BUS) {
         const sender_meaning_t meaning = meaning_of(sender, &frame->classic, time_ns);
-        sender->on_bus(sender->context, time_ns, &meaning);
+        sender->on_command(sender->context, time_ns, &meaning);
     } else if (origin == TRANSPORT_FROM_EMULATOR) {
         if (frame->classic.can_id == (RIG_TRUTH_FAULT_FRAME_ID | CAN_EFF_FLAG)) {
             sender->on_fault(sender->context, time_ns, frame->classic.data[0], frame->classic.data[2] & 1u);

@@ -72,9 +72,8 @@ typedef struct sender {
     uint64_t hash; /* FNV-1a over times, identifiers, lengths and data of the frames on the bus and of the true state */
     uint64_t frames;
     FILE *record; /* every frame that is sent, a line each; NULL: not wanted */
-    void (*on_bus)(void *context, uint64_t time_ns, const sender_meaning_t *meaning);
-    void (*on_status)(void *context, uint64_t time_ns, unsigned state, unsigned fault);
-    void (*on_telemetry)(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]);
+    void (*on_command)(void *context, uint64_t time_ns, const sender_meaning_t *meaning);
+    void (*on_frame)(void *context, uint64_t time_ns, unsigned identifier, const uint8_t data[8]); /* of the drive */
     void (*on_fault)(void *context, uint64_t time_ns, unsigned kind, bool begins);
     void *context;
 } sender_t;

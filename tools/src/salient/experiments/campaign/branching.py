@@ -35,7 +35,7 @@ with sensors of 12 and 17 bits: the fault begins in phase a at every control tic
 speeds, and at the begin of a start from each of 360 positions; one that has once been answered after more than 100
 ms, or not, at every 50th tick and every tenth position. A time is the longest from its begin until the first cause,
 with the number of branches that were answered where not all were within 1 s; a violation, one of the rules of
-[oracle.h](../emulator/campaign/oracle.h).
+[the checkers](../emulator/campaign/CHECKERS.md).
 """
 
 Rows = dict[str, list[dict[str, Any]]]

@@ -12,12 +12,13 @@ SECTORS = 6
 _OF_TARGETS = {"code_flipped", "stack_guard_flipped"}
 _REASONS = {
     "gate_on": {1: "outside of run", 2: "without safe torque off lines", 3: "without a control interrupt"},
-    "no_command": {1: "not armed", 2: "after off", 3: "without a command", 4: "torque without a command",
-                   5: "fault cleared", 6: "in run without a command", 7: "torque grown in silence"},
+    "no_command": {1: "not armed", 2: "after off", 3: "without a command",
+                   5: "fault cleared", 6: "in run without a command", 8: "after a reset"},
+    "torque_in_silence": {4: "not gone", 7: "grown"},
     "cleared": {0: "at the start", 3: "with its cause", 4: "by an earlier request", 5: "before the encoder counts",
                 6: "before both lines were off"},
-    "wrong_telemetry": {**dict.fromkeys(range(4), "current"), 8: "link voltage", 9: "speed",
-                        16: "speed of the snapshot", 17: "link voltage of the snapshot", 18: "current of the snapshot"},
+    "wrong_telemetry": {**dict.fromkeys(range(4), "current"), 8: "link voltage", 9: "speed"},
+    "wrong_snapshot": {16: "speed", 17: "link voltage", 18: "current"},
     "not_recovered": {1: "not in run", 2: "not at the speed", 3: "fault again", 4: "with a phase left out"},
 }
 

@@ -1,0 +1,37 @@
+/* No phase's current is above the comparators' threshold in two looks in succession while a gate of it is on. Without a
+ * gate no drive can end a current, which the rotor or a shorted switch then drives. */
+#include "campaign/checkers/checker.h"
+
+#define LOOKS 2
+
+typedef struct {
+    unsigned looks; /* in succession with a current above */
+} state_t;
+
+/* Tolerance: what the current rises by in a control period, before the comparator's response is latched. */
+static double rise_A(const observation_t *seen, unsigned phase, double current_A) {
+    const plant_t *plant = seen->plant;
+    magnetics_point_t point;
+    magnetics_evaluate(&plant->magnetics, plant_phase_angle_rad(plant, phase), current_A, &point);
+    return plant->bus_voltage_V * (double)seen->period_ns * 1e-9 / point.incremental_inductance_H;
+}
+
+static void on_look(const observation_t *seen, void *memory, checker_report_t *report) {
+    state_t *state = memory;
+    const double threshold_A = seen->plant->machine->trip_current_A;
+    bool above = false;
+    for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {
+        const double current_A = plant_current_A(seen->plant, phase);
+        if (threshold_A == 0.0 || !(seen->gates >> phase & 1u) || current_A <= threshold_A ||
+            current_A <= threshold_A + rise_A(seen, phase, current_A)) {
+            continue;
+        }
+        above = true;
+        if (++state->looks >= LOOKS) {
+            checker_violated(report, phase, current_A / threshold_A);
+        }
+    }
+    state->looks = above ? state->looks : 0;
+}
+
+const checker_t over_current_checker = {.name = "over_current", .state_size = sizeof(state_t), .on_look = on_look};

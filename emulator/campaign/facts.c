@@ -1,0 +1,227 @@
+#include "campaign/facts.h"
+
+#include <math.h>
+
+#include "fault_kinds.h"
+
+/* Default parameters of the drive. */
+#define WINDING_LIMIT_C 155.0
+#define INVERTER_LIMIT_C 100.0
+#define DERATING_K 20.0
+
+#define OBSERVED_S 3e-3       /* until speed and load are observed: three poles at 1000 rad/s */
+#define PHASE_FAULT_US 250000 /* after its end a fault of a phase may still show */
+#define WATCHDOG_NS (18 * MS_NS)
+#define OLD_FRAMES_NS (30 * MS_NS) /* after a reset */
+#define DERATED 0.8                /* of the largest torque */
+#define PUSHING_SPEED 0.05         /* of the base speed, commanded */
+#define HEARD_NS (50 * MS_NS)      /* since the last command: then the torque ramps to zero */
+
+bool facts_disturbed(const observation_t *seen, uint32_t disturbs) {
+    return (seen->disturbed & disturbs) != 0;
+}
+
+bool facts_disturbed_besides(const observation_t *seen, uint32_t disturbs, unsigned kind) {
+    for (unsigned each = 1; each < FAULT_COUNT; each++) {
+        if (each != kind && seen->injected[each] && (fault_effect(each).disturbs & disturbs) != 0) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_any_fault(const observation_t *seen) {
+    return seen->disturbed != 0;
+}
+
+bool facts_undisturbed(const observation_t *seen) {
+    return !facts_any_fault(seen) && !seen->bus_disturbed;
+}
+
+bool facts_variable_begun(const observation_t *seen, uint32_t disturbs, uint64_t time_us) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, time_us);
+        if (event != NULL && event->kind == WORLD_SET && (variable_effect(event->what).disturbs & disturbs) != 0) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_other_sender(const observation_t *seen, bool hostile, uint64_t time_us) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, time_us);
+        if (event != NULL && (event->kind == WORLD_SECOND || (hostile && event->kind == WORLD_HOSTILE))) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_sto_demanded(const observation_t *seen, uint64_t time_us) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = &seen->world->event[i];
+        if (event->kind == WORLD_SET && (variable_effect(event->what).disturbs & VARIABLE_STO) != 0 &&
+            world_active(seen->world, i, time_us)) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_is_load(const world_event_t *event) {
+    return event->kind == WORLD_SET && (variable_effect(event->what).disturbs & VARIABLE_LOAD) != 0;
+}
+
+bool facts_is_load_sine(const world_event_t *event) {
+    return event->kind == WORLD_SET && (variable_effect(event->what).disturbs & VARIABLE_LOAD_SINE) != 0;
+}
+
+bool facts_overhauled(const observation_t *seen, double speed) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, UINT64_MAX);
+        if (event != NULL && facts_is_load(event) && event->raw * speed < 0.0) {
+            return true;
+        }
+    }
+    return false;
+}
+
+unsigned facts_phases_at_fault(const observation_t *seen, uint64_t now_us) {
+    unsigned phases = 0;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, now_us);
+        if (event != NULL && event->kind == WORLD_FAULT &&
+            (fault_effect(event->what).disturbs & (DISTURBS_PHASE | DISTURBS_CURRENT_SENSOR)) != 0 &&
+            (event->end_us == 0 || event->end_us + PHASE_FAULT_US > now_us)) {
+            phases |= 1u << event->phase;
+        }
+    }
+    return phases;
+}
+
+bool facts_impersonated(const observation_t *seen) {
+    bool silent = false, replayed = false;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, UINT64_MAX);
+        if (event != NULL) {
+            silent = silent || event->kind == WORLD_SILENT;
+            replayed = replayed || (event->kind == WORLD_HOSTILE && event->what == WORLD_HOSTILE_REPLAY);
+        }
+    }
+    return silent && replayed;
+}
+
+bool facts_four_quadrants(const observation_t *seen) {
+    return seen->world->controller == CONTROLLER_SALIENT;
+}
+
+bool facts_state_changed(const observation_t *seen) {
+    return facts_disturbed(seen, DISTURBS_STATE);
+}
+
+bool facts_checks_late(const observation_t *seen, uint64_t time_us) {
+    return facts_disturbed(seen, DISTURBS_PROCESSOR) || facts_variable_begun(seen, VARIABLE_DELAYS_INTERRUPTS, time_us);
+}
+
+bool facts_drive_disturbed(const observation_t *seen, uint64_t time_us) {
+    return facts_disturbed(seen, DISTURBS_MEMORY | DISTURBS_CLOCK) || facts_checks_late(seen, time_us);
+}
+
+bool facts_may_be_deaf(const observation_t *seen, uint64_t time_us) {
+    return facts_variable_begun(seen, VARIABLE_LOSES_COMMANDS | VARIABLE_DELAYS_INTERRUPTS, time_us) ||
+           facts_other_sender(seen, false, time_us) || facts_disturbed(seen, DISTURBS_BACKGROUND);
+}
+
+bool facts_frames_are_current(const observation_t *seen) {
+    return !seen->bus_disturbed && !facts_checks_late(seen, seen->time_ns / 1000) &&
+           !seen->injected[FAULT_CLOCK_DRIFT] && seen->time_ns >= seen->reset_ns + OLD_FRAMES_NS;
+}
+
+bool facts_speed_is_observed(const observation_t *seen) {
+    return !facts_disturbed(seen, DISTURBS_ENCODER | DISTURBS_CURRENT_SENSOR | DISTURBS_SHAFT | DISTURBS_LOAD |
+                                      DISTURBS_MEMORY | DISTURBS_CLOCK);
+}
+
+bool facts_can_turn(const observation_t *seen) {
+    return facts_four_quadrants(seen) || seen->client.meant.reference > 0.0;
+}
+
+bool facts_runs_by_speed(const observation_t *seen) {
+    return seen->drive.state == STATE_RUN && seen->client.meant.request == SENDER_RUN && !seen->client.meant.torque &&
+           facts_can_turn(seen);
+}
+
+bool facts_heard(const observation_t *seen) {
+    return seen->time_ns < seen->client.run_ns + HEARD_NS;
+}
+
+bool facts_pushed(const observation_t *seen) {
+    return facts_heard(seen) && !seen->bus_disturbed && facts_runs_by_speed(seen) &&
+           fabs(seen->client.meant.reference) > PUSHING_SPEED * seen->world->machine->speed_base_rpm;
+}
+
+uint64_t facts_request_max_ns(const observation_t *seen, uint64_t max_ns) {
+    return max_ns + (facts_disturbed(seen, DISTURBS_BACKGROUND) ? WATCHDOG_NS : 0);
+}
+
+double facts_stroke_rad(const observation_t *seen) {
+    return TWO_PI / (seen->plant->machine->rotor_poles * seen->plant->machine->phases);
+}
+
+uint64_t facts_strokes_ns(const observation_t *seen, double strokes) {
+    return (uint64_t)(strokes * facts_stroke_rad(seen) * RPM_PER_RAD_S / fabs(seen->client.meant.reference) * 1e9);
+}
+
+double facts_speed_rpm(const observation_t *seen) {
+    return fabs(seen->plant->speed_rad_s) * RPM_PER_RAD_S;
+}
+
+double facts_base_rad_s(const observation_t *seen) {
+    return seen->world->machine->speed_base_rpm / RPM_PER_RAD_S;
+}
+
+double facts_largest_current_A(const observation_t *seen) {
+    double current_A = 0.0;
+    for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {
+        current_A = fmax(current_A, plant_current_A(seen->plant, phase));
+    }
+    return current_A;
+}
+
+double facts_torque_max_Nm(const observation_t *seen) {
+    const world_event_t *limited = seen->limit.limited;
+    return seen->world->machine->torque_max_Nm * (limited != NULL ? limited->value : 1.0);
+}
+
+double facts_needed_s(const observation_t *seen, double change_rad_s) {
+    return seen->plant->machine->inertia_kg_m2 * seen->world->inertia_gain * change_rad_s /
+           (0.5 * facts_torque_max_Nm(seen));
+}
+
+double facts_limit_Nm(const observation_t *seen, const uint8_t data[8]) {
+    struct drive_thermal_t thermal;
+    drive_thermal_unpack(&thermal, data, 8);
+    return thermal.torque_limit_nm * 256.0 * seen->world->machine->command_lsb_Nm;
+}
+
+bool facts_derated(const observation_t *seen) {
+    const observation_range_t *limit_Nm = &seen->limit.limit_Nm;
+    return seen->limit.last_ns != 0 && fmin(limit_Nm->low[0], limit_Nm->low[1]) < DERATED * facts_torque_max_Nm(seen);
+}
+
+double facts_cool_part(double winding_C, double switch_C) {
+    const double room = fmin(WINDING_LIMIT_C - winding_C, INVERTER_LIMIT_C - switch_C) / DERATING_K;
+    return fmin(fmax(room, 0.0), 1.0);
+}
+
+bool facts_sets_in_effect(const observation_t *seen) {
+    return seen->limit.limited != NULL && seen->limit.applied >= 2;
+}
+
+double facts_added_rad_s(const observation_t *seen) {
+    const machine_t *machine = seen->plant->machine;
+    const double late_s =
+        3e-9 * (double)seen->period_ns + OBSERVED_S + seen->largest_flux_Wb / machine->supply_voltage_V;
+    return late_s * seen->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * seen->world->inertia_gain);
+}
