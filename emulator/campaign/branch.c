@@ -227,7 +227,8 @@ static void before_interrupt(run_t *run) {
 }
 
 static void draw_world(world_t *world, const world_machine_t *machine, const branch_setting_t *setting) {
-    const double start_s = machine->image.machine.inertia_kg_m2 * setting->speed_rpm * 0.10472 / machine->torque_max_Nm;
+    const double start_s =
+        machine->image.machine.inertia_kg_m2 * setting->speed_rpm * WORLD_RAD_S_PER_RPM / machine->torque_max_Nm;
     *world = (world_t){.machine = machine,
                        .controller = setting->controller,
                        .control_rate_hz = 40000,

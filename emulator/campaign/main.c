@@ -196,49 +196,70 @@ static bool number(const char *text, uint64_t *value) {
     return errno == 0 && end != text && *end == '\0' && text[0] != '-';
 }
 
+/* The rest of a command line, from an option on. */
+typedef struct {
+    char **words;
+    int count;
+} words_t;
+
+static bool parse_flag(arguments_t *arguments, const char *option) {
+    const struct {
+        const char *name;
+        bool *to;
+    } flags[] = {
+        {"--healthy", &arguments->healthy}, {"--describe", &arguments->describe}, {"--serve", &arguments->serve}};
+    for (unsigned i = 0; i < sizeof flags / sizeof *flags; i++) {
+        if (strcmp(option, flags[i].name) == 0) {
+            return *flags[i].to = true;
+        }
+    }
+    return false;
+}
+
+/* Words that an option with a value takes; 0: no such option, or not a value of it. */
+static int parse_value(arguments_t *arguments, words_t words) {
+    const struct {
+        const char *name;
+        uint64_t *number;
+        const char **text;
+    } options[] = {{"--first", &arguments->first, NULL},
+                   {"--seeds", &arguments->seeds, NULL},
+                   {"--step", &arguments->step, NULL},
+                   {"--keep", &arguments->keep, NULL},
+                   {"--machines", NULL, &arguments->machines_file},
+                   {"--frames", NULL, &arguments->frames_file}};
+    for (unsigned i = 0; i < sizeof options / sizeof *options && words.count > 1; i++) {
+        if (strcmp(words.words[0], options[i].name) != 0) {
+            continue;
+        }
+        if (options[i].text) {
+            *options[i].text = words.words[1];
+        }
+        return options[i].text || number(words.words[1], options[i].number) ? 2 : 0;
+    }
+    return 0;
+}
+
+static int parse_branch(arguments_t *arguments, words_t words) {
+    if (strcmp(words.words[0], "--branch") != 0 || words.count <= BRANCH_ARGUMENTS) {
+        return 0;
+    }
+    arguments->branches = branch_parse(&arguments->branch, &words.words[1]);
+    return arguments->branches ? 1 + BRANCH_ARGUMENTS : 0;
+}
+
 static bool parse(arguments_t *arguments, int argc, char *argv[]) {
     *arguments = (arguments_t){.seeds = 1, .step = 1, .keep = UINT64_MAX};
-    for (int i = 1; i < argc; i++) {
-        const char *option = argv[i];
-        const char *value = i + 1 < argc ? argv[i + 1] : "";
-        const struct {
-            const char *name;
-            uint64_t *to;
-        } numbers[] = {{"--first", &arguments->first},
-                       {"--seeds", &arguments->seeds},
-                       {"--step", &arguments->step},
-                       {"--keep", &arguments->keep}};
-        const struct {
-            const char *name;
-            bool *to;
-        } flags[] = {
-            {"--healthy", &arguments->healthy}, {"--describe", &arguments->describe}, {"--serve", &arguments->serve}};
-        bool known = false;
-        for (unsigned n = 0; n < sizeof flags / sizeof *flags && !known; n++) {
-            known = strcmp(option, flags[n].name) == 0;
-            *flags[n].to = *flags[n].to || known;
-        }
-        for (unsigned n = 0; n < sizeof numbers / sizeof *numbers && !known; n++) {
-            if (strcmp(option, numbers[n].name) == 0) {
-                known = number(value, numbers[n].to);
-                i++;
-            }
-        }
-        if (!known && strcmp(option, "--machines") == 0) {
-            arguments->machines_file = argv[++i < argc ? i : 0];
-            known = true;
-        } else if (!known && strcmp(option, "--frames") == 0) {
-            arguments->frames_file = argv[++i < argc ? i : 0];
-            known = true;
-        } else if (!known && strcmp(option, "--branch") == 0 && i + BRANCH_ARGUMENTS < argc) {
-            known = arguments->branches = branch_parse(&arguments->branch, &argv[i + 1]);
-            i += BRANCH_ARGUMENTS;
-        }
-        if (!known) {
-            fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n", option,
-                    value);
+    for (words_t words = {argv + 1, argc - 1}; words.count > 0;) {
+        int taken = parse_flag(arguments, words.words[0]) ? 1 : parse_value(arguments, words);
+        taken = taken ? taken : parse_branch(arguments, words);
+        if (taken == 0) {
+            fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n",
+                    words.words[0], words.count > 1 ? words.words[1] : "");
             return false;
         }
+        words.words += taken;
+        words.count -= taken;
     }
     if (!arguments->machines_file) {
         fprintf(stderr, "salient: --machines: missing\n");

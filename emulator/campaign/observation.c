@@ -285,10 +285,31 @@ static void see_switching(observation_client_t *client, uint64_t time_ns, sender
     client->withdrawn_ns = request != SENDER_RUN ? time_ns : client->withdrawn_ns;
 }
 
+static void see_clearing(observation_t *seen, sender_request_t request) {
+    observation_client_t *client = &seen->client;
+    client->clear_seen = client->clear_seen || request == SENDER_CLEAR;
+    client->unacknowledged = client->unacknowledged && request != SENDER_CLEAR;
+    if (request == SENDER_CLEAR && (client->meant.request != SENDER_CLEAR || seen->drive.state == STATE_RUN)) {
+        client->clear_ns = seen->time_ns; /* in a run it is refused, and so begins after it */
+    }
+}
+
+static void see_change(observation_t *seen, const sender_meaning_t *meaning, bool after_silence) {
+    observation_client_t *client = &seen->client;
+    const sender_meaning_t *last = &client->meant;
+    const bool stop_begins = meaning->request == SENDER_STOP && last->request != SENDER_STOP;
+    client->stop_speed_rad_s = stop_begins ? seen->plant->speed_rad_s : client->stop_speed_rad_s;
+    client->stop_ns = stop_begins || after_silence ? seen->time_ns : client->stop_ns;
+    if (meaning->torque != last->torque || meaning->reference != last->reference || meaning->request != last->request ||
+        after_silence) {
+        client->constant_ns = seen->time_ns;
+        client->begin_speed_rad_s = seen->plant->speed_rad_s;
+    }
+}
+
 void observation_on_command(observation_t *seen, uint64_t time_ns, const sender_meaning_t *meaning) {
     observation_client_t *client = &seen->client;
-    const sender_request_t last = client->meant.request, request = meaning->request;
-    const double speed_rad_s = seen->plant->speed_rad_s;
+    seen->time_ns = time_ns;
     if (!meaning->genuine) {
         return;
     }
@@ -298,20 +319,9 @@ void observation_on_command(observation_t *seen, uint64_t time_ns, const sender_
         return;
     }
     const bool after_silence = time_ns > client->run_ns + SILENCE_NS;
-    see_switching(client, time_ns, request);
-    client->clear_seen = client->clear_seen || request == SENDER_CLEAR;
-    client->unacknowledged = client->unacknowledged && request != SENDER_CLEAR;
-    if (request == SENDER_CLEAR && (last != SENDER_CLEAR || seen->drive.state == STATE_RUN)) {
-        client->clear_ns = time_ns; /* in a run it is refused, and so begins after it */
-    }
-    const bool stop_begins = request == SENDER_STOP && last != SENDER_STOP;
-    client->stop_speed_rad_s = stop_begins ? speed_rad_s : client->stop_speed_rad_s;
-    client->stop_ns = stop_begins || after_silence ? time_ns : client->stop_ns;
-    if (meaning->torque != client->meant.torque || meaning->reference != client->meant.reference || request != last ||
-        after_silence) {
-        client->constant_ns = time_ns;
-        client->begin_speed_rad_s = speed_rad_s;
-    }
+    see_switching(client, time_ns, meaning->request);
+    see_clearing(seen, meaning->request);
+    see_change(seen, meaning, after_silence);
     client->meant = *meaning;
 }
 

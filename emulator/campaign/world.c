@@ -6,26 +6,8 @@
 
 #include "bench_variables.h"
 #include "campaign/seeded.h"
+#include "campaign/world_draw.h"
 #include "fault_kinds.h"
-
-/* Streams of random numbers; the index within one is that of the draw. */
-enum {
-    STREAM_BOARD = 1,
-    STREAM_IMPERFECTION,
-    STREAM_SPEED,
-    STREAM_LOAD,
-    STREAM_SCRIPT,
-    STREAM_FAULT_ON,
-    STREAM_FAULT,
-    STREAM_BUS,
-    STREAM_GATES,
-    STREAM_TORQUE,
-    STREAM_REQUEST,
-};
-
-#define FAULT_DRAWS 8     /* random numbers of a kind of fault */
-#define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
-#define FAULTS_MAX 6
 
 /* Of the seeds. */
 #define FASTEST_SHARE 0.1        /* at the highest control rate */
@@ -33,22 +15,16 @@ enum {
 #define STOP_SHARE 0.1           /* stopped for some time, or off, */
 #define FAULTLESS_STOP_SHARE 0.3 /* of those without a fault */
 #define HOT_SHARE 0.05           /* with a heat sink that leaves a part of the torque */
-#define DEGRADED_SHARE 0.1
-#define LIMITED_SHARE 0.04 /* with another limit of the torque, */
-#define SAVED_SHARE 0.5    /* which is saved, and there after a reset */
+#define LIMITED_SHARE 0.04       /* with another limit of the torque, */
+#define SAVED_SHARE 0.5          /* which is saved, and there after a reset */
 #define OVERHAULING_SHARE 0.1
 #define RUNAWAY_SHARE 0.3        /* of the torque mode: the largest torque, to the end */
 #define TORQUE_STOP_SHARE 0.3    /* of the torque mode: ends with a stop */
-#define REMAINING_SHARE 0.3      /* of the faults: until all are over */
 #define LONG_SHARE 0.08          /* long enough for what takes long to be noticed, */
 #define FAULTLESS_LONG_SHARE 0.4 /* or to be followed */
-#define LASTING_SHARE 0.06       /* one fault alone, to the end of a long world */
 #define WRONG_CHECK_SHARE 0.15   /* of the sets of parameters */
-#define SLOW_SHARE 0.6           /* of them: of a kind that takes long to be noticed */
-#define FAULTLESS_SHARE 0.15     /* no fault of the bench */
 #define BEYOND_SHARE 0.04        /* a speed beyond the largest one is commanded for some time */
 #define CLEARING_SHARE 0.03      /* the client sends nothing but clear_fault until all is over */
-#define SECOND_LOSS_SHARE 0.4    /* of the worlds with one lost phase */
 #define REVERSE_SHARE 0.4        /* of the speeds, with a controller of four quadrants, */
 #define REFUSED_SHARE 0.05       /* and of one, which does not turn then */
 #define KEEPING_SHARE 0.5        /* the reference stays in the frames of stop and off */
@@ -71,7 +47,7 @@ static int32_t raw_of(unsigned variable, double value) {
                          bench_variables[variable].raw_maximum);
 }
 
-static world_event_t *add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us) {
+world_event_t *world_add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us) {
     if (world->events == WORLD_EVENTS_MAX) {
         return NULL;
     }
@@ -80,8 +56,8 @@ static world_event_t *add(world_t *world, world_kind_t kind, uint64_t begin_us, 
     return event;
 }
 
-static void add_set(world_t *world, unsigned variable, double value, double after, uint64_t begin_us, uint64_t end_us) {
-    world_event_t *event = add(world, WORLD_SET, begin_us, end_us);
+void world_add_set(world_t *world, unsigned variable, double value, double after, uint64_t begin_us, uint64_t end_us) {
+    world_event_t *event = world_add(world, WORLD_SET, begin_us, end_us);
     if (event) {
         event->what = variable;
         event->raw = raw_of(variable, value);
@@ -90,14 +66,14 @@ static void add_set(world_t *world, unsigned variable, double value, double afte
 }
 
 static void add_speed(world_t *world, double rpm, uint64_t begin_us) {
-    world_event_t *event = add(world, WORLD_SPEED, begin_us, 0);
+    world_event_t *event = world_add(world, WORLD_SPEED, begin_us, 0);
     if (event) {
         const double limit = world->machine->speed_command_max_rpm;
         event->value = fmax(fmin(rpm, limit), -limit);
     }
 }
 
-static double logarithmic(uint64_t seed, uint64_t stream, uint64_t index, double low, double high) {
+double world_logarithmic(uint64_t seed, uint64_t stream, uint64_t index, double low, double high) {
     return exp(seeded_between(seed, stream, index, log(low), log(high)));
 }
 
@@ -128,7 +104,7 @@ static void draw_imperfections(world_t *world) {
     const uint64_t seed = world->seed;
     const machine_t *machine = &world->machine->image.machine;
     const double range_A = machine->ranges.current_A;
-    world->inertia_gain = logarithmic(seed, STREAM_IMPERFECTION, 2, 0.7, 2.0);
+    world->inertia_gain = world_logarithmic(seed, STREAM_IMPERFECTION, 2, 0.7, 2.0);
     const struct {
         unsigned variable;
         double value;
@@ -144,7 +120,7 @@ static void draw_imperfections(world_t *world) {
     for (unsigned i = 0; i < sizeof all / sizeof *all; i++) {
         const bool always = world->healthy && all[i].variable == BENCH_VARIABLE_RESISTANCE_GAIN;
         if (seeded_unit(seed, STREAM_IMPERFECTION, 100 + i) < 0.5 || always) {
-            add_set(world, all[i].variable, all[i].value, all[i].value, 0, 0);
+            world_add_set(world, all[i].variable, all[i].value, all[i].value, 0, 0);
         } else if (all[i].variable == BENCH_VARIABLE_INERTIA_GAIN) {
             world->inertia_gain = 1.0;
         }
@@ -155,12 +131,12 @@ static void draw_imperfections(world_t *world) {
 static double load_max_Nm(const world_t *world, double rpm) {
     const world_machine_t *machine = world->machine;
     const double part = fabs(rpm) / machine->speed_base_rpm;
-    const double friction = machine->image.machine.friction_Nm_s * 3.0 * fabs(rpm) * 0.10472;
+    const double friction = machine->image.machine.friction_Nm_s * 3.0 * fabs(rpm) * WORLD_RAD_S_PER_RPM;
     return fmax(0.0, 0.6 * machine->torque_rated_Nm * (part < 0.8 ? 1.0 : 0.8 / part) - friction);
 }
 
 static double draw_speed_rpm(const world_t *world, unsigned index) {
-    const double rpm = world->machine->speed_base_rpm * logarithmic(world->seed, STREAM_SPEED, index, 0.02, 1.0);
+    const double rpm = world->machine->speed_base_rpm * world_logarithmic(world->seed, STREAM_SPEED, index, 0.02, 1.0);
     const double share = world->controller == 2 ? REVERSE_SHARE : REFUSED_SHARE;
     const bool reverse = seeded_unit(world->seed, STREAM_SPEED, 50 + index) < share;
     return reverse ? -rpm : rpm;
@@ -181,18 +157,18 @@ static void draw_load(world_t *world, double rpm, uint64_t begin_us) {
     case 0:
         break;
     case 1:
-        add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us);
+        world_add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us);
         break;
     case 2:
-        add_set(world, ramp, torque_Nm / logarithmic(seed, STREAM_LOAD, 2, 0.002, 0.2), 0.0, begin_us - 1000,
-                world->recovery_us);
-        add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us ? world->recovery_us + 1000 : 0);
+        world_add_set(world, ramp, torque_Nm / world_logarithmic(seed, STREAM_LOAD, 2, 0.002, 0.2), 0.0,
+                      begin_us - 1000, world->recovery_us);
+        world_add_set(world, step, sign * torque_Nm, 0.0, begin_us, world->recovery_us ? world->recovery_us + 1000 : 0);
         break;
     default:
-        add_set(world, BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ, logarithmic(seed, STREAM_LOAD, 3, 1.0, 100.0), 1.0,
-                begin_us - 1000, 0);
-        add_set(world, sine, 0.3 * torque_Nm, 0.0, begin_us, world->recovery_us);
-        add_set(world, step, sign * 0.7 * torque_Nm, 0.0, begin_us, world->recovery_us);
+        world_add_set(world, BENCH_VARIABLE_LOAD_SINE_FREQUENCY_HZ, world_logarithmic(seed, STREAM_LOAD, 3, 1.0, 100.0),
+                      1.0, begin_us - 1000, 0);
+        world_add_set(world, sine, 0.3 * torque_Nm, 0.0, begin_us, world->recovery_us);
+        world_add_set(world, step, sign * 0.7 * torque_Nm, 0.0, begin_us, world->recovery_us);
         break;
     }
 }
@@ -204,13 +180,13 @@ static void draw_torque(world_t *world, uint64_t last_us) {
         return;
     }
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_TORQUE, 1, 0.0, (double)last_us);
-    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_TORQUE, 2, 5e3, 3e5);
+    const uint64_t end_us = begin_us + (uint64_t)world_logarithmic(seed, STREAM_TORQUE, 2, 5e3, 3e5);
     const bool runaway = seeded_unit(seed, STREAM_TORQUE, 4) < RUNAWAY_SHARE;
-    world_event_t *event = add(world, WORLD_TORQUE, begin_us, end_us < last_us && !runaway ? end_us : last_us);
+    world_event_t *event = world_add(world, WORLD_TORQUE, begin_us, end_us < last_us && !runaway ? end_us : last_us);
     const double part = seeded_between(seed, STREAM_TORQUE, 3, world->controller == 2 ? -1.0 : 0.0, 1.0);
     event->value = runaway ? copysign(world->machine->torque_max_Nm, part) : part * world->machine->torque_rated_Nm;
     if (!world->healthy && seeded_unit(seed, STREAM_TORQUE, 5) < TORQUE_STOP_SHARE) {
-        world_event_t *stop = add(world, WORLD_REQUEST, begin_us + (event->end_us - begin_us) / 3, last_us);
+        world_event_t *stop = world_add(world, WORLD_REQUEST, begin_us + (event->end_us - begin_us) / 3, last_us);
         stop->what = WORLD_REQUEST_STOP;
         event->end_us = last_us;
     }
@@ -218,176 +194,40 @@ static void draw_torque(world_t *world, uint64_t last_us) {
 
 static double start_s(const world_t *world, double from_rpm, double to_rpm) {
     const machine_t *machine = &world->machine->image.machine;
-    return machine->inertia_kg_m2 * world->inertia_gain * fabs(to_rpm - from_rpm) * 0.10472 /
+    return machine->inertia_kg_m2 * world->inertia_gain * fabs(to_rpm - from_rpm) * WORLD_RAD_S_PER_RPM /
            world->machine->torque_max_Nm;
-}
-
-/* --- Faults --- */
-
-static double attribute_of(const world_t *world, unsigned kind, double unit) {
-    const machine_t *machine = &world->machine->image.machine;
-    const double range_A = machine->ranges.current_A, range_V = machine->ranges.dc_link_V;
-    switch (kind) {
-    case FAULT_WINDING_SHORTED:
-        return 2.0 + 48.0 * unit;
-    case FAULT_CURRENT_SENSOR_STUCK:
-    case FAULT_DC_LINK_SENSOR_STUCK:
-        return floor(unit * (double)(1u << world->adc_bits));
-    case FAULT_CURRENT_SENSOR_GAIN:
-        return unit < 0.5 ? unit : 2.0 + 4.0 * (unit - 0.5);
-    case FAULT_CURRENT_SENSOR_OFFSET:
-        return (unit - 0.5) * 0.8 * range_A;
-    case FAULT_CURRENT_SENSOR_SWAPPED:
-        return floor(unit * machine->phases);
-    case FAULT_DC_LINK_SENSOR_GAIN:
-        return unit < 0.5 ? unit : 1.3 + 2.0 * (unit - 0.5);
-    case FAULT_DC_LINK_SENSOR_OFFSET:
-        return (unit - 0.5) * range_V;
-    case FAULT_ENCODER_JUMP:
-        return (unit < 0.5 ? -1.0 : 1.0) * exp(log(0.2) + (log(180.0) - log(0.2)) * fabs(2.0 * unit - 1.0));
-    case FAULT_ENCODER_LOST_COUNTS:
-        return floor(exp(log(0.005) * unit) * (double)(1u << world->encoder_bits) * 0.2) + 1.0;
-    case FAULT_ENCODER_NOISE:
-        return 0.3 + 9.0 * unit;
-    case FAULT_ENCODER_SLIP:
-        return (unit - 0.5) * 700.0;
-    case FAULT_COULOMB_FRICTION:
-    case FAULT_STATIC_FRICTION:
-        return fmin(500.0, world->machine->torque_max_Nm * (0.3 + unit));
-    case FAULT_SUPPLY_SAGGED:
-        return 100.0 * unit;
-    case FAULT_SUPPLY_SURGED:
-        return 10.0 + 90.0 * unit;
-    case FAULT_SUPPLY_RIPPLE:
-        return fmin(500.0, machine->supply_voltage_V * 0.6 * unit);
-    case FAULT_WINDING_TO_EARTH:
-        return 0.001 * exp(log(1000.0) * unit);
-    case FAULT_WINDING_TEMPERATURE_SENSOR_STUCK:
-    case FAULT_INVERTER_TEMPERATURE_SENSOR_STUCK:
-        return floor(unit * (double)(1u << world->adc_bits));
-    case FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET:
-    case FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET:
-        return (unit - 0.5) * 400.0;
-    case FAULT_INTERRUPT_LATE:
-        return exp(log(5.0) + log(1e4) * unit);
-    case FAULT_LIMIT_FLIPPED:
-    case FAULT_CONSTANT_FLIPPED:
-    case FAULT_STATE_FLIPPED:
-    case FAULT_FAULT_LATCH_FLIPPED:
-    case FAULT_PERIOD_REGISTER_FLIPPED:
-        return floor(unit * (fault_kinds[kind].raw_maximum + 1.0));
-    case FAULT_CLOCK_DRIFT:
-        return (unit - 0.5) * 200.0;
-    default:
-        return 0.0;
-    }
-}
-
-static bool possible(const world_t *world, unsigned kind) {
-    const machine_t *machine = &world->machine->image.machine;
-    /* The host has no program and no stack of the drive alone. */
-    const bool of_target = kind == FAULT_CODE_FLIPPED || kind == FAULT_STACK_GUARD_FLIPPED;
-    return fault_kinds[kind].name && !of_target &&
-           !(kind == FAULT_CHOPPER_OPEN &&
-             (machine->dc_link.capacitance_F == 0.0 || machine->dc_link.chopper_resistance_ohm == 0.0));
-}
-
-static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {
-    const uint64_t seed = world->seed, base = (uint64_t)kind * FAULT_DRAWS;
-    /* A fifth is there before the start. */
-    const bool early = seeded_unit(seed, STREAM_FAULT, base) < 0.2;
-    const uint64_t begin_us = early ? 0 : (uint64_t)seeded_between(seed, STREAM_FAULT, base + 1, 5e3, (double)last_us);
-    uint64_t end_us = begin_us + 20 + (uint64_t)logarithmic(seed, STREAM_FAULT, base + 2, 30.0, 2e5);
-    const bool remains = seeded_unit(seed, STREAM_FAULT, base + 6) < REMAINING_SHARE;
-    end_us = end_us < last_us && !remains ? end_us : last_us;
-    world_event_t *event = end_us > begin_us ? add(world, WORLD_FAULT, begin_us, end_us) : NULL;
-    if (!event) {
-        return;
-    }
-    event->what = kind;
-    event->phase = fault_kinds[kind].has_phase
-                       ? seeded_below(seed, STREAM_FAULT, base + 3, world->machine->image.machine.phases)
-                       : 0;
-    event->leg = fault_kinds[kind].has_leg ? seeded_below(seed, STREAM_FAULT, base + 4, 2) : 0;
-    const double value = attribute_of(world, kind, seeded_unit(seed, STREAM_FAULT, base + 5));
-    if (fault_kinds[kind].has_attribute) {
-        event->raw = (int32_t)fmin(fmax(floor(value / fault_kinds[kind].scale + 0.5), fault_kinds[kind].raw_minimum),
-                                   fault_kinds[kind].raw_maximum);
-    }
-    event->value = value;
-}
-
-/* Faults of the bus, both lines of safe torque off, late interrupts and resets: bench variables. */
-static void draw_other_faults(world_t *world, uint64_t last_us) {
-    const uint64_t seed = world->seed;
-    const struct {
-        unsigned variable;
-        double value, after;
-    } all[] = {
-        {BENCH_VARIABLE_STO_1, 1, 0},
-        {BENCH_VARIABLE_STO_2, 1, 0},
-        {BENCH_VARIABLE_INTERRUPT_TIME_US, logarithmic(seed, STREAM_GATES, 90, 5.0, 5000.0), 0},
-        {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, seeded_between(seed, STREAM_BUS, 90, 20.0, 100.0), 0},
-        {BENCH_VARIABLE_BUS_CONNECTION, 0, 1},
-        {BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, 256, 0},
-        {BENCH_VARIABLE_FRAME_FAULT, 1 + seeded_below(seed, STREAM_BUS, 91, 4), 0},
-        {BENCH_VARIABLE_DRIVE_RESET, 1, 0},
-    };
-    for (unsigned i = 0; i < sizeof all / sizeof *all; i++) {
-        if (seeded_unit(seed, STREAM_GATES, i) >= 0.05) {
-            continue;
-        }
-        const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_GATES, 20 + i, 2e3, (double)last_us);
-        uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_GATES, 40 + i, 100.0, 3e5);
-        end_us = end_us < last_us ? end_us : last_us;
-        if (all[i].variable == BENCH_VARIABLE_FRAME_FAULT) {
-            add_set(world, BENCH_VARIABLE_FRAME_FAULT_PER_MILLE, seeded_between(seed, STREAM_BUS, 92, 10.0, 1000.0),
-                    0.0, begin_us, end_us);
-            add_set(world, BENCH_VARIABLE_FRAME_DELAY_US, seeded_between(seed, STREAM_BUS, 93, 0.0, 1e5), 0.0, begin_us,
-                    0);
-        }
-        const bool once =
-            all[i].variable == BENCH_VARIABLE_DRIVE_RESET || all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
-        add_set(world, all[i].variable, all[i].value, all[i].after, begin_us, once ? 0 : end_us);
-        if (all[i].variable == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER && seeded_unit(seed, STREAM_BUS, 94) < 0.5) {
-            add_set(world, all[i].variable, all[i].value, all[i].after, end_us, 0); /* once more */
-        }
-    }
 }
 
 static void draw_script(world_t *world, uint64_t last_us) {
     const uint64_t seed = world->seed;
     const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_SCRIPT, 1, 2e4, (double)last_us);
-    const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 1.5e6);
+    const uint64_t end_us = begin_us + (uint64_t)world_logarithmic(seed, STREAM_SCRIPT, 2, 5e3, 1.5e6);
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     if (sort < SILENT_PART) {
-        add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
-        const uint64_t again_us = end_us + (uint64_t)logarithmic(seed, STREAM_SCRIPT, 7, 1e4, 1e5);
+        world_add(world, WORLD_SILENT, begin_us, end_us < last_us ? end_us : last_us);
+        const uint64_t again_us = end_us + (uint64_t)world_logarithmic(seed, STREAM_SCRIPT, 7, 1e4, 1e5);
         if (again_us < last_us) {
-            add(world, WORLD_SILENT, again_us, last_us);
+            world_add(world, WORLD_SILENT, again_us, last_us);
         }
     } else if (sort < HOSTILE_PART) {
         if (sort < DESERTED_PART) {
-            add(world, WORLD_SILENT, begin_us, last_us);
+            world_add(world, WORLD_SILENT, begin_us, last_us);
         }
-        world_event_t *event = add(world, WORLD_HOSTILE, begin_us, end_us < last_us ? end_us : last_us);
+        world_event_t *event = world_add(world, WORLD_HOSTILE, begin_us, end_us < last_us ? end_us : last_us);
         event->what = seeded_below(seed, STREAM_SCRIPT, 3, WORLD_HOSTILE_SORTS);
     } else if (sort < SECOND_PART) {
         if (sort < DESERTED_SECOND_PART) { /* the second client alone */
-            add(world, WORLD_SILENT, begin_us, last_us);
+            world_add(world, WORLD_SILENT, begin_us, last_us);
         }
-        add(world, WORLD_SECOND, begin_us, end_us < last_us ? end_us : last_us);
+        world_add(world, WORLD_SECOND, begin_us, end_us < last_us ? end_us : last_us);
     }
     if (seeded_unit(seed, STREAM_SCRIPT, 4) < 0.3) {
-        add(world, WORLD_EAGER, 0, 0);
+        world_add(world, WORLD_EAGER, 0, 0);
     }
     if (seeded_unit(seed, STREAM_SCRIPT, 5) < 0.05) {
-        add(world, WORLD_UNARMED, (uint64_t)seeded_between(seed, STREAM_SCRIPT, 6, 0.0, (double)last_us), last_us);
+        world_add(world, WORLD_UNARMED, (uint64_t)seeded_between(seed, STREAM_SCRIPT, 6, 0.0, (double)last_us),
+                  last_us);
     }
-}
-
-static bool faultless(uint64_t seed) {
-    return seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE;
 }
 
 static bool hot(uint64_t seed) {
@@ -401,97 +241,35 @@ static bool limited(uint64_t seed) {
 /* In a part of the worlds the client stops the drive for some time, or switches it off. */
 static void draw_request(world_t *world, uint64_t last_us) {
     const uint64_t seed = world->seed;
-    if (seeded_unit(seed, STREAM_REQUEST, 0) < (faultless(seed) ? FAULTLESS_STOP_SHARE : STOP_SHARE)) {
+    if (seeded_unit(seed, STREAM_REQUEST, 0) < (world_is_faultless(seed) ? FAULTLESS_STOP_SHARE : STOP_SHARE)) {
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 1, 1e4, (double)last_us);
-        const uint64_t end_us = begin_us + (uint64_t)logarithmic(seed, STREAM_REQUEST, 2, 2e3, 1e6);
-        world_event_t *event = add(world, WORLD_REQUEST, begin_us, end_us < last_us ? end_us : last_us);
+        const uint64_t end_us = begin_us + (uint64_t)world_logarithmic(seed, STREAM_REQUEST, 2, 2e3, 1e6);
+        world_event_t *event = world_add(world, WORLD_REQUEST, begin_us, end_us < last_us ? end_us : last_us);
         event->what = seeded_unit(seed, STREAM_REQUEST, 3) < 0.7 ? WORLD_REQUEST_STOP : WORLD_REQUEST_OFF;
     }
     if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE) {
-        world_event_t *event = add(world, WORLD_DEGRADED, 0, 0);
+        world_event_t *event = world_add(world, WORLD_DEGRADED, 0, 0);
         event->what = seeded_unit(seed, STREAM_REQUEST, 16) < WRONG_CHECK_SHARE ? WORLD_DEGRADED_WRONG_CHECK
                                                                                 : WORLD_DEGRADED_RIGHT_CHECK;
     }
     if (limited(seed)) {
-        world_event_t *event = add(world, WORLD_LIMITED, 0, 0);
+        world_event_t *event = world_add(world, WORLD_LIMITED, 0, 0);
         event->value = seeded_between(seed, STREAM_REQUEST, 19, 0.6, 0.85);
         event->what = seeded_unit(seed, STREAM_REQUEST, 20) < SAVED_SHARE;
         if (event->what) {
             const uint64_t reset_us = (uint64_t)(seeded_between(seed, STREAM_REQUEST, 21, 0.4, 0.7) * (double)last_us);
-            add_set(world, BENCH_VARIABLE_DRIVE_RESET, 1, 0, reset_us, 0);
+            world_add_set(world, BENCH_VARIABLE_DRIVE_RESET, 1, 0, reset_us, 0);
         }
     }
     if (seeded_unit(seed, STREAM_REQUEST, 6) < BEYOND_SHARE) {
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_REQUEST, 7, 1e4, (double)last_us);
-        world_event_t *event = add(world, WORLD_BEYOND, begin_us, last_us);
+        world_event_t *event = world_add(world, WORLD_BEYOND, begin_us, last_us);
         const double part = seeded_between(seed, STREAM_REQUEST, 8, 1.01, 2.0);
         event->value = seeded_unit(seed, STREAM_REQUEST, 9) < 0.5 ? -part : part;
     }
     if (seeded_unit(seed, STREAM_REQUEST, 10) < CLEARING_SHARE) {
-        world_event_t *event = add(world, WORLD_REQUEST, 0, last_us);
+        world_event_t *event = world_add(world, WORLD_REQUEST, 0, last_us);
         event->what = WORLD_REQUEST_CLEAR;
-    }
-}
-
-/* Of two phases, one after the other. */
-static bool loses_two(uint64_t seed) {
-    return seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0 &&
-           seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE;
-}
-
-static bool lasting(uint64_t seed) {
-    return seeded_unit(seed, STREAM_REQUEST, 11) < LASTING_SHARE;
-}
-
-/* Some of the kinds; in half of the worlds with degraded running one that such a drive runs on with, alone. */
-static void draw_faults(world_t *world, uint64_t last_us) {
-    static const unsigned endured[] = {FAULT_WINDING_OPEN, FAULT_SWITCH_OPEN, FAULT_GATE_SUPPLY_LOST,
-                                       FAULT_CURRENT_SENSOR_OPEN};
-    static const unsigned slow[] = {FAULT_SHAFT_LOCKED,
-                                    FAULT_SHAFT_LOCKED,
-                                    FAULT_COULOMB_FRICTION,
-                                    FAULT_STATIC_FRICTION,
-                                    FAULT_CURRENT_SENSOR_GAIN,
-                                    FAULT_ENCODER_STUCK,
-                                    FAULT_ENCODER_SLIP,
-                                    FAULT_ENCODER_LOST_COUNTS,
-                                    FAULT_CHOPPER_OPEN,
-                                    FAULT_WINDING_TEMPERATURE_SENSOR_OFFSET,
-                                    FAULT_INVERTER_TEMPERATURE_SENSOR_OFFSET};
-    const uint64_t seed = world->seed;
-    if (seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0) {
-        const unsigned first = seeded_below(seed, STREAM_REQUEST, 5, 4), from = world->events;
-        draw_fault(world, endured[first], last_us);
-        if (loses_two(seed)) {
-            draw_fault(world, endured[(first + 1) % 4], last_us);
-            for (unsigned i = from; i < world->events; i++) {
-                world->event[i].end_us = last_us;
-            }
-        }
-        return;
-    }
-    if (lasting(seed)) {
-        const bool slow_one = seeded_unit(seed, STREAM_REQUEST, 15) < SLOW_SHARE;
-        const unsigned kind = slow_one ? slow[seeded_below(seed, STREAM_REQUEST, 13, sizeof slow / sizeof *slow)]
-                                       : 1 + seeded_below(seed, STREAM_REQUEST, 13, FAULT_COUNT - 1);
-        if (possible(world, kind)) {
-            draw_fault(world, kind, last_us);
-        }
-        if (world->events > 0 && world->event[world->events - 1].kind == WORLD_FAULT) {
-            world->event[world->events - 1].end_us = last_us;
-        }
-        return;
-    }
-    if (faultless(seed)) {
-        return;
-    }
-    unsigned faults = 0;
-    for (unsigned i = 1; i < FAULT_COUNT && faults < FAULTS_MAX; i++) {
-        const unsigned kind = 1 + (i + (unsigned)(seed % (FAULT_COUNT - 1))) % (FAULT_COUNT - 1);
-        if (possible(world, kind) && seeded_unit(seed, STREAM_FAULT_ON, kind) < FAULT_SHARE) {
-            draw_fault(world, kind, last_us);
-            faults++;
-        }
     }
 }
 
@@ -505,8 +283,10 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     const double sort = seeded_unit(seed, STREAM_SCRIPT, 0);
     const bool deserted =
         (sort >= SILENT_PART && sort < DESERTED_PART) || (sort >= HOSTILE_PART && sort < DESERTED_SECOND_PART);
-    const bool is_long = sort < 0.04 || deserted || lasting(seed) || loses_two(seed) || limited(seed) || hot(seed) ||
-                         seeded_unit(seed, STREAM_SCRIPT, 8) < (faultless(seed) ? FAULTLESS_LONG_SHARE : LONG_SHARE);
+    const bool is_long =
+        sort < 0.04 || deserted || world_has_lasting_fault(seed) || world_loses_two(seed) || limited(seed) ||
+        hot(seed) ||
+        seeded_unit(seed, STREAM_SCRIPT, 8) < (world_is_faultless(seed) ? FAULTLESS_LONG_SHARE : LONG_SHARE);
     last_us = is_long ? 900000 : last_us;
     world->recovery_us = last_us + 25000;
     add_speed(world, first_rpm, 0);
@@ -520,10 +300,10 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
     draw_request(world, last_us);
     if (hot(seed)) {
         const double inverter_C = seeded_between(seed, STREAM_REQUEST, 23, 84.0, 90.0);
-        add_set(world, BENCH_VARIABLE_HELD_INVERTER_C, inverter_C, 25.0, 0, last_us);
+        world_add_set(world, BENCH_VARIABLE_HELD_INVERTER_C, inverter_C, 25.0, 0, last_us);
     }
-    draw_faults(world, last_us);
-    draw_other_faults(world, last_us);
+    world_draw_faults(world, last_us);
+    world_draw_other_faults(world, last_us);
     world->duration_us = world->recovery_us + 320000;
 }
 

@@ -6,7 +6,7 @@
 
 #include "campaign/observation.h"
 
-#define CHECKERS_VIOLATIONS_MAX 4
+#define CHECKERS_VIOLATIONS_MAX 32
 #define CHECKERS_STATE_BYTES 2048
 #define CHECKERS_SECTORS 6
 #define CHECKERS_STATES 4
