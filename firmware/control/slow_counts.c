@@ -128,9 +128,11 @@ NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const 
                                     uint32_t encoder_angle, unsigned encoder_shift) {
     const int32_t change = (int32_t)(encoder_angle - results->encoder_angle);
     const int32_t last = (int32_t)((1u << encoder_shift) - 1u);
+    if (change != 0) {
+        return encoder_angle + (change > 0 ? 0 : (uint32_t)last);
+    }
     const int32_t predicted = (int32_t)((uint32_t)(observer->angle_q64 >> 32) - encoder_angle);
-    const int32_t nearest = fixed_clamp(predicted, 0, last);
-    return encoder_angle + (uint32_t)(change == 0 ? nearest : change > 0 ? 0 : last);
+    return encoder_angle + (uint32_t)fixed_clamp(predicted, 0, last);
 }
 
 const load_observer_gains_t *slow_counts_gains(const slow_counts_parameters_t *parameters,

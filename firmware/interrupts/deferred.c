@@ -77,6 +77,9 @@ static void hand_over_predictive(const control_state_t *state, deferred_input_t 
 static void hand_over_duty(const control_parameters_t *parameters, control_state_t *state, deferred_input_t *input) {
     const control_measurement_t *measured = &state->measurement;
     const unsigned regulated = state->duty.regulated;
+    if (regulated >= HAL_PHASES_MAX) {
+        return;
+    }
     input->regulated_angle = commutation_angle(&parameters->commutation, &measured->commutation, regulated);
     input->regulated_current_q9 = measured->current_q9[regulated];
     hand_over_pid(&state->duty.pid, input);
@@ -107,7 +110,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         hand_over_predictive(state, input);
-    } else if (parameters->torque_law == TORQUE_LAW_DUTY && state->duty.regulated < HAL_PHASES_MAX) {
+    } else if (parameters->torque_law == TORQUE_LAW_DUTY) {
         hand_over_duty(parameters, state, input);
     }
     deferred_request(request);
@@ -516,7 +519,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     results->observer = deferred->inertia.laws.observer;
     results->predictive.conduction = deferred->conduction.latest;
     UNROLL(4)
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         results->predictive.misalignment[phase] = deferred->misalignment.phase[phase].offset;
     }
 }

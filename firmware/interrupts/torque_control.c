@@ -37,8 +37,10 @@ static int32_t torque_error_q24(const control_state_t *state) {
                                 state->table_scale.inverse_excess_q31);
 }
 
-static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
-                               const deferred_results_t *deferred) {
+/* Not inlined: with the rest of the interrupt it needs more registers than there are, 4 of the computed bound of
+ * traditional. */
+NOINLINE static void hysteresis_control(const control_parameters_t *parameters, control_state_t *state,
+                                        const deferred_results_t *deferred) {
     const control_measurement_t *measured = &state->measurement;
     commutation_t commutation = {.electrical = measured->commutation.electrical};
     commutation_find(&parameters->commutation, &commutation);
@@ -111,7 +113,7 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
         return;
     }
     if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, deferred)) {
-        hysteresis_control(parameters, state, deferred); /* in one place, so that it is inlined */
+        hysteresis_control(parameters, state, deferred);
     }
     const uint32_t lost = state->lost_phase;
     if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */

@@ -43,11 +43,12 @@ static uint32_t count_overruns(protection_t *protection, uint32_t missed_interru
     return overruns;
 }
 
-/* True when the angle changed by more than the rotor can turn, over the lost periods as well. */
+/* True when the angle changed by more than the rotor can turn, over the lost periods as well. More lost periods are the
+ * fault interrupt_overrun, and no other one follows from what the rotor did meanwhile. */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
     const uint32_t step_max = (uint32_t)parameters->angle_step_max;
     const uint32_t limit = step_max * missed_interrupts + step_max;
-    return (uint32_t)angle_step + limit > 2 * limit;
+    return ((uint32_t)angle_step + limit > 2 * limit) & (missed_interrupts < PROTECTION_OVERRUNS_MAX);
 }
 
 /* The encoder has counted. Not inlined, which saves the longer path three instructions. */
@@ -86,43 +87,29 @@ static bool encoder_frozen(const protection_parameters_t *parameters, protection
     return protection->frozen;
 }
 
-/* Which checks failed; by value, because what is passed by its address would have to be in memory in every period. */
-NOINLINE static uint32_t failed_checks(const protection_parameters_t *parameters, protection_input_t input,
-                                       uint32_t overruns, bool jumped) {
-    uint32_t failed = 0;
-    fail_if(&failed, input.current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);
-    fail_if(&failed, input.dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
-    /* More lost periods are the fault interrupt_overrun, and what the rotor did meanwhile is no other. */
-    fail_if(&failed, jumped && input.missed_interrupts < PROTECTION_OVERRUNS_MAX, FAULT_ENCODER);
-    fail_if(&failed, overruns >= PROTECTION_OVERRUNS_MAX, FAULT_INTERRUPT_OVERRUN);
-    fail_if(&failed, (input.break_causes & HAL_PWM_BREAK_NOT_RENEWED) != 0, FAULT_INTERRUPT_OVERRUN);
-    fail_if(&failed, (input.break_causes & HAL_PWM_BREAK_OVER_CURRENT) != 0, FAULT_HARDWARE_OVER_CURRENT);
-    fail_if(&failed, (input.break_causes & (HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2)) != 0, FAULT_STO);
-    fail_if(&failed, input.skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX, FAULT_INTERRUPT_OVERRUN);
-    return failed;
-}
-
 uint64_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_input_t *input) {
     const int32_t angle_step = (int32_t)(input->encoder_angle - protection->encoder_angle); /* modulo one revolution */
     protection->encoder_angle = input->encoder_angle;
-    /* Whether any check failed, in one condition; a margin, within 2^17, is negative when its check failed. */
-    const int32_t margins = (parameters->current_trip_q9 - input->current_max_q9) |
-                            (parameters->dc_link_over_voltage_q6 - input->dc_link_voltage_q6);
-    const uint32_t causes = input->break_causes | input->skipped_deferred / PROTECTION_SKIPPED_DEFERRED_MAX;
-    const bool jumped = encoder_jumped(parameters, angle_step, input->missed_interrupts);
     const uint32_t overruns = count_overruns(protection, input->missed_interrupts);
-    if (LIKELY(margins >= 0 && causes == 0 && !jumped && overruns < PROTECTION_OVERRUNS_MAX)) {
-        return 0;
-    }
-    return failed_checks(parameters, *input, overruns, jumped);
+    uint32_t failed = 0;
+    /* This order takes four instructions less than that of the faults: a single bit, moved, initialises the mask. */
+    fail_if(&failed, (input->break_causes & HAL_PWM_BREAK_OVER_CURRENT) != 0, FAULT_HARDWARE_OVER_CURRENT);
+    fail_if(&failed, (input->break_causes & (HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2)) != 0, FAULT_STO);
+    fail_if(&failed, input->current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);
+    fail_if(&failed, input->dc_link_voltage_q6 > parameters->dc_link_over_voltage_q6, FAULT_OVER_VOLTAGE);
+    fail_if(&failed, (input->break_causes & HAL_PWM_BREAK_NOT_RENEWED) != 0, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, overruns >= PROTECTION_OVERRUNS_MAX, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, input->skipped_deferred >= PROTECTION_SKIPPED_DEFERRED_MAX, FAULT_INTERRUPT_OVERRUN);
+    fail_if(&failed, encoder_jumped(parameters, angle_step, input->missed_interrupts), FAULT_ENCODER);
+    return failed;
 }
 
 uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
                                    const protection_deferred_input_t *input) {
     uint32_t failed = 0;
-    fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
     fail_if(&failed, encoder_frozen(parameters, protection, input), FAULT_ENCODER);
+    fail_if(&failed, input->dc_link_voltage_q6 < parameters->dc_link_under_voltage_q6, FAULT_UNDER_VOLTAGE);
     fail_if(&failed, input->command_age_us > parameters->command_timeout_us, FAULT_COMMAND_TIMEOUT);
     return failed;
 }
