@@ -2,6 +2,7 @@
 
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
+#include "interrupts/deferred_jobs.h"
 #include "interrupts/speed_control.h"
 #include "interrupts/torque_control.h"
 
@@ -238,7 +239,7 @@ static int32_t told_by_flux(const control_parameters_t *parameters, const deferr
     return misalignment != 0 ? fixed_subtract(misalignment, excused) : 0;
 }
 
-/* While counts are slow the ripple teaches nothing; the gains of the coming counts by the slope of the torque. */
+/* One phase by its flux linkage alone, and the gains of the coming counts by the slope of the torque. */
 NOINLINE static void learn_between_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                           const deferred_input_t *input,
                                           const int32_t flux_misalignment[HAL_PHASES_MAX]) {
@@ -281,10 +282,34 @@ static int32_t stroke_part_q16(const control_parameters_t *parameters, const def
     return (int32_t)((uint64_t)fixed_magnitude(rotation(parameters, input)) * strokes * DEFERRED_COMMON_PERIODS >> 16);
 }
 
+/* While counts are slow the ripple teaches nothing. */
+static void learn_phase(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                        const int32_t flux_misalignment[HAL_PHASES_MAX]) {
+    if (deferred->slow_counts.slow) {
+        learn_between_counts(parameters, deferred, input, flux_misalignment);
+    } else {
+        learn_misalignment(parameters, deferred, input, flux_misalignment);
+    }
+}
+
 static void learn_common_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                       const deferred_input_t *input) {
     misalignment_common_step(&parameters->misalignment, &deferred->misalignment, machine_tables.phases,
                              input->torque_reference_q24, stroke_part_q16(parameters, input));
+}
+
+static void follow_strokes(const control_parameters_t *parameters, deferred_t *deferred,
+                           const deferred_input_t *input) {
+    const bool constant =
+        stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical, input->load_torque_q24,
+                         input->torque_reference_q24, disturbed(parameters, input));
+    deferred->load_constant = constant && !deferred->periodic_load.engaged;
+}
+
+static void review_moving_load(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input) {
+    moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
+                       deferred->periodic_load.engaged);
 }
 
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
@@ -300,6 +325,18 @@ static void learn_periodic_load(const control_parameters_t *parameters, deferred
         .moving = deferred->moving_load.withheld > 0 && !deferred->load_constant,
     };
     periodic_load_step(&parameters->periodic_load, &deferred->periodic_load, &sample);
+}
+
+/* Either of both, and in the turn in which a stroke has ended neither: each of the three takes the time of one. */
+static void review_stroke_or_learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
+                                                 const deferred_input_t *input) {
+    stroke_mean_t *strokes = &deferred->stroke_mean;
+    if (stroke_mean_to_review(strokes)) {
+        stroke_mean_review(&parameters->stroke_mean, strokes);
+        misalignment_end_stroke(&deferred->misalignment, strokes->changed, strokes->grown);
+    } else if (!stroke_mean_ended(strokes)) {
+        learn_periodic_load(parameters, deferred, input);
+    }
 }
 
 static bool at_torque_limit(const deferred_t *deferred, int32_t torque_q24) {
@@ -326,18 +363,18 @@ static void approach_reference(const control_parameters_t *parameters, deferred_
 
 _Static_assert(DEFERRED_COMMON_PERIODS / DEFERRED_LEARNING_PERIODS == 4, "four samples in the mean torque");
 
-/* Of the samples since the last update of the inertia, which is in the turn before the first; rounded down. */
-static void average_torque(deferred_t *deferred, int32_t torque_q24) {
-    const int32_t before_q24 = deferred->turn == DEFERRED_COMMON_PERIODS - 1 ? 0 : deferred->mean_torque_q24;
-    deferred->mean_torque_q24 = before_q24 + (torque_q24 >> 2);
+/* Mean over the samples since the last update of the inertia; rounded down. */
+static void average_torque(deferred_t *deferred, const deferred_input_t *input) {
+    deferred->mean_torque_q24 += input->torque_sum_q24 >> 2;
 }
 
-/* A torque that is at its limit in order to change the speed follows no load. */
+/* A torque that is at its limit in order to change the speed follows no load. The next mean torque begins. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
     inertia_step(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical,
                  deferred->mean_torque_q24, at_torque_limit(deferred, input->torque_reference_q24),
                  deferred->approaches_reference);
+    deferred->mean_torque_q24 = 0;
 }
 
 static void move_conduction(const control_parameters_t *parameters, deferred_t *deferred,
@@ -416,48 +453,35 @@ static pwm_ditc_plan_t plan_duty(const control_parameters_t *parameters, const d
     return pwm_ditc_plan(&parameters->duty, &machine_tables, &sample);
 }
 
-/* What is not urgent, in eight turns: no step takes the time of all. The learning of the phases has half of them,
- * because at a high bandwidth of the observer it follows within a millisecond. */
-NOINLINE static void take_turns(const control_parameters_t *parameters, deferred_t *deferred,
-                                const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
+static const uint8_t turns[] = {DEFERRED_TURNS};
+_Static_assert(sizeof turns == DEFERRED_COMMON_PERIODS, "a turn in each step");
+
+/* Jobs of one turn, a constant: their calls are all that is left of the table. */
+ALWAYS_INLINE void run_jobs(deferred_turn_t turn, const control_parameters_t *parameters, deferred_t *deferred,
+                            const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
+#define JOB(of, call, before, after, writes)                                                                           \
+    if (turn == (of)) {                                                                                                \
+        call;                                                                                                          \
+    }
+#include "interrupts/deferred_jobs.def"
+#undef JOB
+}
+
+NOINLINE static void take_turn(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     deferred->turn = (deferred->turn + 1) % DEFERRED_COMMON_PERIODS;
-    switch (deferred->turn) {
-    case 0:
-    case DEFERRED_SLOW_PERIODS:
-        deferred->load_constant =
-            stroke_mean_step(&parameters->stroke_mean, &deferred->stroke_mean, input->electrical,
-                             input->load_torque_q24, input->torque_reference_q24, disturbed(parameters, input)) &&
-            !deferred->periodic_load.engaged;
-        step_torque_offset(parameters, deferred, input);
-        set_speed_law(parameters, deferred);
-        moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
-                           deferred->periodic_load.engaged);
-        if (stroke_mean_to_review(&deferred->stroke_mean)) {
-            stroke_mean_review(&parameters->stroke_mean, &deferred->stroke_mean);
-            misalignment_end_stroke(&deferred->misalignment, deferred->stroke_mean.changed,
-                                    deferred->stroke_mean.grown);
-        } else if (!stroke_mean_ended(&deferred->stroke_mean)) { /* both have taken their time */
-            learn_periodic_load(parameters, deferred, input);
-        }
+    switch (turns[deferred->turn]) {
+    case TURN_LOAD:
+        run_jobs(TURN_LOAD, parameters, deferred, input, flux_misalignment);
         break;
-    case 2:
-        learn_common_misalignment(parameters, deferred, input);
-        approach_reference(parameters, deferred, input);
-        move_conduction(parameters, deferred, input);
+    case TURN_PHASE:
+        run_jobs(TURN_PHASE, parameters, deferred, input, flux_misalignment);
         break;
-    case 6:
-        periodic_load_review(&deferred->periodic_load);
-        identify_inertia(parameters, deferred, input);
-        move_conduction(parameters, deferred, input);
+    case TURN_COMMON:
+        run_jobs(TURN_COMMON, parameters, deferred, input, flux_misalignment);
         break;
     default:
-        average_torque(deferred, input->torque_sum_q24);
-        if (deferred->slow_counts.slow) {
-            learn_between_counts(parameters, deferred, input, flux_misalignment);
-            break;
-        }
-        learn_misalignment(parameters, deferred, input, flux_misalignment);
-        await_slow_counts(parameters, deferred, input, input->periods + DEFERRED_LEARNING_PERIODS - 1u);
+        run_jobs(TURN_INERTIA, parameters, deferred, input, flux_misalignment);
         break;
     }
 }
@@ -511,7 +535,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);
     } else if (!reset) { /* a step that resets has done enough */
-        take_turns(parameters, deferred, input, state->flux_misalignment);
+        take_turn(parameters, deferred, input, state->flux_misalignment);
     }
     if (parameters->torque_law == TORQUE_LAW_DUTY) {
         tune_pid(parameters, deferred, input, run_reset, results);

@@ -25,8 +25,8 @@
 
 #include "interrupts/control_step.h"
 
-/* Periods per update of what takes turns: learning of the phases; torque offset, mean load and periodic load; learning
- * of their common angle, inertia; conduction angles. */
+/* Periods per update of the jobs that take turns (deferred_jobs.def): learning of the phases; torque offset, mean load
+ * and periodic load; learning of their common angle, inertia; conduction angles. */
 #define DEFERRED_LEARNING_PERIODS 2
 #define DEFERRED_SLOW_PERIODS 4
 #define DEFERRED_COMMON_PERIODS 8
