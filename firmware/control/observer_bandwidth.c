@@ -64,8 +64,8 @@ static uint32_t limited_steady_rad_s(uint32_t steady_rad_s, uint64_t square) {
 static uint8_t first_stage(const observer_bandwidth_parameters_t *parameters, unsigned first, uint32_t max_rad_s,
                            uint64_t square, unsigned share) {
     unsigned stage = first;
-    while (stage < STEADY_STAGE && (parameters->bandwidth_rad_s[stage] > max_rad_s ||
-                                    !within(parameters->bandwidth_rad_s[stage], square, share))) {
+    while (stage < STEADY_STAGE && (parameters->stage[stage].bandwidth_rad_s > max_rad_s ||
+                                    !within(parameters->stage[stage].bandwidth_rad_s, square, share))) {
         stage++;
     }
     return (uint8_t)stage;
@@ -87,14 +87,15 @@ static void configure_stages(const observer_bandwidth_settings_t *settings, obse
         const bool steady = stage >= STEADY_STAGE || bandwidth_q8 >> 8 <= steady_rad_s;
         const uint32_t decayed_rad_s = steady ? steady_rad_s : bandwidth_q8 >> 8;
         const uint32_t bandwidth_rad_s = stage == LAST_STAGE ? last_rad_s : decayed_rad_s;
-        parameters->bandwidth_rad_s[stage] = (uint16_t)bandwidth_rad_s;
-        parameters->gains[stage] =
-            load_observer_gains(bandwidth_rad_s, settings->control_rate_hz, settings->inertia_q30);
-        /* 5 / t is then midway between the bandwidths of this stage and the next: t = 1.1 * 5 / w0. */
-        parameters->end_ticks[stage] = settings->control_rate_hz * 550u / 100u / bandwidth_rad_s;
+        parameters->stage[stage] = (observer_bandwidth_stage_t){
+            .gains = load_observer_gains(bandwidth_rad_s, settings->control_rate_hz, settings->inertia_q30),
+            .bandwidth_rad_s = bandwidth_rad_s,
+            /* 5 / t is then midway between the bandwidths of this stage and the next: t = 1.1 * 5 / w0. */
+            .end_ticks = settings->control_rate_hz * 550u / 100u / bandwidth_rad_s,
+        };
         bandwidth_q8 = bandwidth_q8 / 16 * 13;
     }
-    parameters->end_ticks[STEADY_STAGE] = parameters->end_ticks[LAST_STAGE]; /* one step, however far */
+    parameters->stage[STEADY_STAGE].end_ticks = parameters->stage[LAST_STAGE].end_ticks; /* one step, however far */
 }
 
 observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_bandwidth_settings_t *settings) {
@@ -103,20 +104,21 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
     const bool adaptive = settings->transient_rad_s > settings->steady_rad_s;
     const uint32_t threshold_count = adaptive ? count + count / 8 + THRESHOLD_IDEAL : THRESHOLD_NEVER;
     observer_bandwidth_parameters_t parameters = {
-        .retrigger_holdoff_ticks = rate_hz / 1000u,
-        .holdoff_decay_q32 = (65536u - (65536u * HOLDOFF_DECAY_1_S + rate_hz - 1) / rate_hz) << 16,
-        .threshold_count = threshold_count,
-        .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
-        .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, rate_hz),
-        .threshold_error = 3u * count / 8u,
-        .beat_step_min = count / 2,
-        .beat_rounding_min_q4 = 16u * count / BEAT_PARTS,
-        .edge_step_min = count / (rate_hz / EDGE_RATE_MIN_HZ),
-        .adaptive = adaptive,
-        .trigger_stage_count = LAST_STAGE,
-        .moving_stage = LAST_STAGE,
-        .steady_stage_edge = LAST_STAGE,
-    };
+        .schedule = {
+            .retrigger_holdoff_ticks = rate_hz / 1000u,
+            .holdoff_decay_q32 = (65536u - (65536u * HOLDOFF_DECAY_1_S + rate_hz - 1) / rate_hz) << 16,
+            .threshold_count = threshold_count,
+            .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
+            .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, rate_hz),
+            .threshold_error = 3u * count / 8u,
+            .beat_step_min = count / 2,
+            .beat_rounding_min_q4 = 16u * count / BEAT_PARTS,
+            .edge_step_min = count / (rate_hz / EDGE_RATE_MIN_HZ),
+            .adaptive = adaptive,
+            .trigger_stage_count = LAST_STAGE,
+            .moving_stage = LAST_STAGE,
+            .steady_stage_edge = LAST_STAGE,
+        }};
     if (!adaptive) {
         configure_stages(settings, &parameters, settings->steady_rad_s, settings->steady_rad_s);
         return parameters;
@@ -126,10 +128,11 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
     configure_stages(settings, &parameters, steady_rad_s, beat_rad_s(steady_rad_s, square));
     /* Counts finer than the resolution of an edge's time are as good as edges. */
     const unsigned first = threshold_count <= THRESHOLD_EDGE ? 0 : TRIGGER_STAGE_COARSE;
-    parameters.trigger_stage_count = first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
-    parameters.moving_stage =
-        first_stage(&parameters, parameters.trigger_stage_count, settings->moving_rad_s, square, MOVING_SHARE);
-    parameters.steady_stage_edge = STEADY_STAGE - (steady_rad_s < settings->steady_rad_s);
+    const uint8_t trigger_stage = first_stage(&parameters, first, settings->transient_rad_s, square, TRIGGER_SHARE);
+    parameters.schedule.trigger_stage_count = trigger_stage;
+    parameters.schedule.moving_stage =
+        first_stage(&parameters, trigger_stage, settings->moving_rad_s, square, MOVING_SHARE);
+    parameters.schedule.steady_stage_edge = STEADY_STAGE - (steady_rad_s < settings->steady_rad_s);
     return parameters;
 }
 
@@ -137,9 +140,8 @@ void observer_bandwidth_reset(observer_bandwidth_t *bandwidth) {
     *bandwidth = (observer_bandwidth_t){.stage = 0};
 }
 
-static uint32_t threshold_of(const observer_bandwidth_parameters_t *parameters, uint32_t threshold_mean,
-                             bool from_edge) {
-    const uint32_t threshold_min = from_edge ? parameters->threshold_edge : parameters->threshold_count;
+static uint32_t threshold_of(const observer_bandwidth_schedule_t *schedule, uint32_t threshold_mean, bool from_edge) {
+    const uint32_t threshold_min = from_edge ? schedule->threshold_edge : schedule->threshold_count;
     return threshold_mean > threshold_min ? threshold_mean : threshold_min;
 }
 
@@ -154,14 +156,15 @@ static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters
     bandwidth->ticks = (uint32_t)fixed_add((int32_t)bandwidth->ticks, 1);
     /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
      */
-    const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->end_ticks[bandwidth->stage]);
+    const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->stage[bandwidth->stage].end_ticks);
     const unsigned last = LAST_STAGE - limits->withheld_stages;
     bandwidth->stage = next < last ? next : last;
-    if (fixed_magnitude(innovation) > threshold_of(parameters, limits->threshold_mean, from_edge) &&
+    if (fixed_magnitude(innovation) > threshold_of(&parameters->schedule, limits->threshold_mean, from_edge) &&
         bandwidth->ticks >= limits->holdoff_ticks) {
-        bandwidth->trigger = bandwidth->stage >= parameters->steady_stage_edge ? OBSERVER_TRIGGER_IN_STEADY_STATE
-                                                                               : OBSERVER_TRIGGER_IN_DECAY;
-        bandwidth->stage = from_edge ? limits->trigger_stage_edge : parameters->trigger_stage_count;
+        bandwidth->trigger = bandwidth->stage >= parameters->schedule.steady_stage_edge
+                                 ? OBSERVER_TRIGGER_IN_STEADY_STATE
+                                 : OBSERVER_TRIGGER_IN_DECAY;
+        bandwidth->stage = from_edge ? limits->trigger_stage_edge : parameters->schedule.trigger_stage_count;
         bandwidth->ticks = 0;
     }
     return bandwidth->stage;
@@ -171,26 +174,27 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
                                                      observer_bandwidth_t *bandwidth,
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      const bool *from_edge) {
-    const unsigned stage =
-        parameters->adaptive ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge) : LAST_STAGE;
-    return &parameters->gains[stage];
+    const unsigned stage = parameters->schedule.adaptive
+                               ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge)
+                               : LAST_STAGE;
+    return &parameters->stage[stage].gains;
 }
 
-void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
                                observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
                                uint32_t angle_step, uint32_t rounding_q4, uint32_t withheld_stages,
                                observer_bandwidth_limits_t *limits) {
     const bool triggered_steady = sample->trigger == OBSERVER_TRIGGER_IN_STEADY_STATE;
     const bool was_steady =
-        sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage >= parameters->steady_stage_edge : triggered_steady;
+        sample->trigger == OBSERVER_TRIGGER_NONE ? sample->stage >= schedule->steady_stage_edge : triggered_steady;
     if (was_steady) {
         /* Innovations are clipped at the threshold, so that a load step does not raise it. */
-        const uint32_t threshold = threshold_of(parameters, threshold_of_mean(statistics), sample->from_edge);
+        const uint32_t threshold = threshold_of(schedule, threshold_of_mean(statistics), sample->from_edge);
         const uint32_t magnitude = fixed_magnitude(sample->innovation);
         const int32_t clipped = (int32_t)(magnitude < threshold ? magnitude : threshold);
         const int32_t mean = (int32_t)(statistics->mean_innovation_q32 >> 32);
         statistics->mean_innovation_q32 =
-            fixed_accumulate(statistics->mean_innovation_q32, clipped - mean, parameters->mean_innovation_gain_q32);
+            fixed_accumulate(statistics->mean_innovation_q32, clipped - mean, schedule->mean_innovation_gain_q32);
     }
     if (sample->trigger != OBSERVER_TRIGGER_NONE) {
         const uint32_t growth_q16 =
@@ -200,17 +204,17 @@ void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters
             extension_q16 < HOLDOFF_EXTENSION_MAX_Q16 ? extension_q16 : HOLDOFF_EXTENSION_MAX_Q16;
     }
     statistics->holdoff_extension_q16 =
-        (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * parameters->holdoff_decay_q32) >> 32);
-    const bool frequent_edges = sample->from_edge && angle_step >= parameters->edge_step_min;
-    const bool beat = !sample->from_edge && rounding_q4 >= parameters->beat_rounding_min_q4 &&
-                      angle_step >= parameters->beat_step_min;
-    const uint32_t withheld_min = frequent_edges ? LAST_STAGE - parameters->steady_stage_edge : !beat;
-    const uint32_t threshold_beat = beat ? rounding_q4 / 8 + parameters->threshold_error : 0;
-    const uint32_t threshold_mean = threshold_of(parameters, threshold_of_mean(statistics), frequent_edges);
+        (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * schedule->holdoff_decay_q32) >> 32);
+    const bool frequent_edges = sample->from_edge && angle_step >= schedule->edge_step_min;
+    const bool beat =
+        !sample->from_edge && rounding_q4 >= schedule->beat_rounding_min_q4 && angle_step >= schedule->beat_step_min;
+    const uint32_t withheld_min = frequent_edges ? LAST_STAGE - schedule->steady_stage_edge : !beat;
+    const uint32_t threshold_beat = beat ? rounding_q4 / 8 + schedule->threshold_error : 0;
+    const uint32_t threshold_mean = threshold_of(schedule, threshold_of_mean(statistics), frequent_edges);
     limits->threshold_mean = threshold_mean > threshold_beat ? threshold_mean : threshold_beat;
     limits->withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min);
-    limits->trigger_stage_edge = frequent_edges ? 0 : parameters->trigger_stage_count;
+    limits->trigger_stage_edge = frequent_edges ? 0 : schedule->trigger_stage_count;
     limits->holdoff_ticks =
-        parameters->retrigger_holdoff_ticks +
-        (uint32_t)(((uint64_t)(parameters->retrigger_holdoff_ticks << 16) * statistics->holdoff_extension_q16) >> 32);
+        schedule->retrigger_holdoff_ticks +
+        (uint32_t)(((uint64_t)(schedule->retrigger_holdoff_ticks << 16) * statistics->holdoff_extension_q16) >> 32);
 }

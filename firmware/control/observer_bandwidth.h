@@ -56,10 +56,14 @@
 #define OBSERVER_BANDWIDTH_STEADY_STAGE (OBSERVER_BANDWIDTH_STAGES - 2)
 
 typedef struct {
-    load_observer_gains_t gains[OBSERVER_BANDWIDTH_STAGES];
-    uint16_t bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES];
-    uint32_t end_ticks[OBSERVER_BANDWIDTH_STAGES]; /* end of each stage, periods since the trigger */
-    uint32_t retrigger_holdoff_ticks;              /* minimum hold-off after a trigger, periods */
+    load_observer_gains_t gains;
+    uint32_t bandwidth_rad_s;
+    uint32_t end_ticks; /* end of the stage, periods since the trigger */
+} observer_bandwidth_stage_t;
+
+/* Which stage follows which, and when. */
+typedef struct {
+    uint32_t retrigger_holdoff_ticks; /* minimum hold-off after a trigger, periods */
     uint32_t holdoff_decay_q32;       /* decay factor of the hold-off extension per period, unsigned Q0.32 */
     uint32_t threshold_count;         /* 2^-32 rev, for the middle of a count */
     uint32_t threshold_edge;          /* 2^-32 rev, for an angle from the time of an edge */
@@ -72,6 +76,12 @@ typedef struct {
     uint8_t trigger_stage_count;      /* first stage after a trigger by a count; by frequent edges stage 0 */
     uint8_t moving_stage;             /* while the load moves */
     uint8_t steady_stage_edge;        /* in the steady state with frequent edges */
+} observer_bandwidth_schedule_t;
+
+/* All of it is tunable in a run (configure_tune), a member or stage at a time. */
+typedef struct {
+    observer_bandwidth_schedule_t schedule;
+    observer_bandwidth_stage_t stage[OBSERVER_BANDWIDTH_STAGES];
 } observer_bandwidth_parameters_t;
 
 /* Trigger in the last sample or samples. In the steady state it is a new event; during a decay it may belong to the
@@ -82,7 +92,7 @@ typedef enum {
     OBSERVER_TRIGGER_IN_STEADY_STATE,
 } observer_trigger_t;
 
-/* Schedule, advanced by every sample. */
+/* Position in the schedule, advanced by every sample. */
 typedef struct {
     unsigned stage;
     uint32_t ticks;             /* periods since the last trigger, saturates to 2^31 - 1 */
@@ -140,7 +150,7 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
  * moving_load_step.
  * 64-bit products, rounded down. A sample that is left out does not change the statistics; its trigger counts in the
  * next. */
-void observer_bandwidth_update(const observer_bandwidth_parameters_t *parameters,
+void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
                                observer_bandwidth_statistics_t *statistics, const observer_bandwidth_sample_t *sample,
                                uint32_t angle_step, uint32_t rounding_q4, uint32_t withheld_stages,
                                observer_bandwidth_limits_t *limits);

@@ -36,9 +36,9 @@ COLD static void configure(drive_t *drive) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
     } else {
-        configure_tune(&drive->control_parameters, &control_parameters, 0);
+        configure_tune(&drive->control_parameters, &control_parameters, CONFIGURE_TUNE_SPEED);
         deferred_tune(&drive->control_parameters, &drive->control);
-        for (unsigned part = 1; part < CONFIGURE_TUNE_PARTS; part++) {
+        for (unsigned part = CONFIGURE_TUNE_SPEED + 1; part < CONFIGURE_TUNE_PARTS; part++) {
             hal_critical_leave(drive->hal);
             hal_critical_enter(drive->hal);
             configure_tune(&drive->control_parameters, &control_parameters, part);

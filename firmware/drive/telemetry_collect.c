@@ -113,7 +113,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
 
     telemetry->adaptation.misalignment_deg = units_deviation_q20(misalignment(drive));
     telemetry->adaptation.torque_missing_nm = salient ? units_torque_q8(control->predictive.torque_shortfall_q24) : 0;
-    telemetry->adaptation.observer_bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[control->bandwidth.stage];
+    telemetry->adaptation.observer_bandwidth_rad_s =
+        parameters->bandwidth.stage[control->bandwidth.stage].bandwidth_rad_s;
 
     telemetry->fault_cause.time_us = record->time_us;
     telemetry->fault_cause.fault = record->fault;

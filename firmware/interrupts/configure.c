@@ -351,10 +351,12 @@ static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
 /* 2^32 / (2 pi): 2^-32 rev in a rad. */
 #define ANGLE_PER_RAD_Q29 INT64_C(366986312910250153)
 
-/* Slowest clock of whose ticks edge_angle_per_tick_q51 fits 32 bits; of a slower one, of a part of a tick. */
+/* Slowest clock at which the rotation in a tick, edge_angle_per_tick_q51, fits 32 bits. With a slower clock it is that
+ * in a tick divided by a power of 2, by which the age is multiplied. */
 #define EDGE_CLOCK_MIN_HZ 171000000u
 
-/* Of measure.c. At 200 MHz a tick is 5 ns. */
+/* Scale of the age of an encoder edge, by which measure.c extrapolates the angle: ticks, of 5 ns at 200 MHz, to a
+ * rotation at the observer's speed. */
 static void set_edge_timing(control_parameters_t *control, unsigned speed_exponent, uint32_t timer_clock_hz) {
     unsigned shift = 0;
     while (timer_clock_hz << shift < EDGE_CLOCK_MIN_HZ) {
@@ -385,163 +387,204 @@ static degraded_parameters_t degraded_from(const control_parameters_t *control, 
     };
 }
 
-control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
-                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
-                                       uint32_t timer_clock_hz) {
-    const int32_t *values = parameters->values;
-    const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
-    const int32_t friction_q30 = values[PARAMETER_FRICTION_NM_S];
-    const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
-    const unsigned encoder_shift = 32u - encoder_bits;
-    const controller_t controller = controller_from(values);
-    const int32_t torque_min_q24 = controller.four_quadrant ? -torque_max_q24 : 0;
+/* What the parameters are derived from. */
+typedef struct {
+    const int32_t *values; /* of the user's parameters */
+    const machine_tables_t *tables;
+    uint32_t control_rate_hz;
+    unsigned encoder_bits, adc_bits;
+    uint32_t timer_clock_hz;
+    controller_t controller;
+    int32_t torque_min_q24; /* of the drive, N m, Q7.24; the maximum is a parameter */
+} source_t;
 
-    control_parameters_t control = {
-        .controller = (drive_controller_t)values[PARAMETER_CONTROLLER],
-        .speed_law = controller.speed_law,
-        .torque_law = controller.torque_law,
-        .speed_reference_min_q22 = controller.four_quadrant ? INT32_MIN : 0,
-        .interleaved_pwm = controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2,
-        .load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0,
-        .period_ticks = (uint16_t)(timer_clock_hz / (2u * control_rate_hz)),
-        .encoder_shift = (uint8_t)encoder_shift,
-        .encoder_middle = (1u << encoder_shift) >> 1,
-        .adc_bits = (uint8_t)adc_bits,
-        .current_scale_q18 = COUNT_SCALE_Q18(tables->current_range_q9, adc_bits),
-        .voltage_scale_q18 = COUNT_SCALE_Q18(tables->voltage_range_q6, adc_bits),
-        .initialise_ticks = control_rate_hz / 1000u,
-        .speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], control_rate_hz),
-        .observer = load_observer_model(control_rate_hz, inertia_q30, friction_q30),
-        .bandwidth = bandwidth_from(values, controller.schedules_bandwidth, control_rate_hz, encoder_bits),
-        .speed_pi =
-            {
-                .kp_q16 = values[PARAMETER_SPEED_KP],
-                .ki_step_q32 = fixed_saturate(fixed_divide((int64_t)values[PARAMETER_SPEED_KI] << 16, control_rate_hz)),
-                .torque_min_q24 = 0,
-                .torque_max_q24 = torque_max_q24,
-            },
-        .speed_smc =
-            {
-                .gain_q24 = fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22),
-                .epsilon_q31 = epsilon_q31(values, fixed_multiply(inertia_q30, values[PARAMETER_SMC_K], 22)),
-                .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
-                .friction_q30 = friction_q30,
-            },
-        .commutation = commutation_configure(
-            &(commutation_angles_t){
-                .turn_on = angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
-                .turn_off = angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
-                .outgoing_off = angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
-            },
-            tables->phases, tables->rotor_poles),
-        .hysteresis =
-            {
-                .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
-                .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
-            },
-        .duty =
-            {
-                .pid = bp_pid_from(values, control_rate_hz),
-                .current_setpoints =
-                    pwm_ditc_setpoints(tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
-                /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
-                .incoming_gain_q24 =
-                    fixed_saturate(fixed_divide((int64_t)control_rate_hz << 23, tables->current_slew_rate_A_s)),
-                .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
-            },
-        .predictive = predictive_from(values, tables->phases, control_rate_hz),
-        .conduction = conduction_from(values, tables, control_rate_hz, torque_min_q24),
-        .stroke_mean = stroke_mean_configure(tables->phases, control_rate_hz / DEFERRED_SLOW_PERIODS),
+/* From counts and ticks to the units of the laws. */
+static void set_sampling(control_parameters_t *control, const source_t *from) {
+    const unsigned encoder_shift = 32u - from->encoder_bits;
+    control->period_ticks = (uint16_t)(from->timer_clock_hz / (2u * from->control_rate_hz));
+    control->encoder_shift = (uint8_t)encoder_shift;
+    control->encoder_middle = (1u << encoder_shift) >> 1;
+    control->adc_bits = (uint8_t)from->adc_bits;
+    control->current_scale_q18 = COUNT_SCALE_Q18(from->tables->current_range_q9, from->adc_bits);
+    control->voltage_scale_q18 = COUNT_SCALE_Q18(from->tables->voltage_range_q6, from->adc_bits);
+    control->initialise_ticks = from->control_rate_hz / 1000u;
+    set_edge_timing(control, from->tables->speed_exponent, from->timer_clock_hz);
+}
+
+static speed_smc_parameters_t smc_from(const int32_t *values) {
+    const int32_t gain_q24 = fixed_multiply(values[PARAMETER_INERTIA_KG_M2], values[PARAMETER_SMC_K], 22);
+    return (speed_smc_parameters_t){
+        .gain_q24 = gain_q24,
+        .epsilon_q31 = epsilon_q31(values, gain_q24),
+        .delta_q27 = fixed_multiply(values[PARAMETER_SMC_DELTA], LOG2_E_Q30, 19),
+        .friction_q30 = values[PARAMETER_FRICTION_NM_S],
     };
-    control.protection = protection_from(values, control.observer.angle_step_q32, encoder_shift, control_rate_hz);
-    limit_currents(&control, values, tables, control_rate_hz);
-    set_reference_point(&control, values, tables, control_rate_hz);
-    control.degraded = degraded_from(&control, values);
-    set_edge_timing(&control, tables->speed_exponent, timer_clock_hz);
-    control.misalignment = misalignment_configure(&(misalignment_settings_t){
+}
+
+/* Observer, speed laws and torque mode. */
+static void set_speed_control(control_parameters_t *control, const source_t *from) {
+    const int32_t *values = from->values;
+    const uint32_t rate_hz = from->control_rate_hz;
+    const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
+    control->speed_law = from->controller.speed_law;
+    control->speed_reference_min_q22 = from->controller.four_quadrant ? INT32_MIN : 0;
+    control->load_from_transducer = values[PARAMETER_LOAD_SOURCE] != 0;
+    control->speed_ramp_q22 = ramp_q22(values[PARAMETER_SPEED_RAMP_RPM_S], rate_hz);
+    control->observer = load_observer_model(rate_hz, values[PARAMETER_INERTIA_KG_M2], values[PARAMETER_FRICTION_NM_S]);
+    control->bandwidth = bandwidth_from(values, from->controller.schedules_bandwidth, rate_hz, from->encoder_bits);
+    control->speed_pi = (speed_pi_parameters_t){
+        .kp_q16 = values[PARAMETER_SPEED_KP],
+        .ki_step_q32 = fixed_saturate(fixed_divide((int64_t)values[PARAMETER_SPEED_KI] << 16, rate_hz)),
+        .torque_min_q24 = 0,
+        .torque_max_q24 = torque_max_q24,
+    };
+    control->speed_smc = smc_from(values);
+    control->torque_mode =
+        torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], rate_hz, from->torque_min_q24, torque_max_q24,
+                              fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
+    control->speed_reference_max_q22 = speed_reference_max_q22(&control->torque_mode, from->tables);
+}
+
+static pwm_ditc_parameters_t duty_from(const source_t *from) {
+    const int32_t *values = from->values;
+    return (pwm_ditc_parameters_t){
+        .pid = bp_pid_from(values, from->control_rate_hz),
+        .current_setpoints =
+            pwm_ditc_setpoints(from->tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+        /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
+        .incoming_gain_q24 =
+            fixed_saturate(fixed_divide((int64_t)from->control_rate_hz << 23, from->tables->current_slew_rate_A_s)),
+        .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
+    };
+}
+
+static void set_torque_control(control_parameters_t *control, const source_t *from) {
+    const int32_t *values = from->values;
+    control->torque_law = from->controller.torque_law;
+    control->interleaved_pwm = from->controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2;
+    control->commutation = commutation_configure(
+        &(commutation_angles_t){
+            .turn_on = angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
+            .turn_off = angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
+            .outgoing_off = angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
+        },
+        from->tables->phases, from->tables->rotor_poles);
+    control->hysteresis = (ditc_hysteresis_parameters_t){
+        .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
+        .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
+    };
+    control->duty = duty_from(from);
+    control->predictive = predictive_from(values, from->tables->phases, from->control_rate_hz);
+    control->conduction = conduction_from(values, from->tables, from->control_rate_hz, from->torque_min_q24);
+    limit_currents(control, values, from->tables, from->control_rate_hz);
+    set_reference_point(control, values, from->tables, from->control_rate_hz);
+}
+
+/* What learns or adapts during a run; after the laws, whose parameters it needs. */
+static void set_estimators(control_parameters_t *control, const source_t *from) {
+    const int32_t *values = from->values;
+    const machine_tables_t *tables = from->tables;
+    const uint32_t rate_hz = from->control_rate_hz;
+    const int32_t inertia_q30 = values[PARAMETER_INERTIA_KG_M2];
+    const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
+    const observer_bandwidth_parameters_t *bandwidth = &control->bandwidth;
+    const observer_bandwidth_stage_t *moving = &bandwidth->stage[bandwidth->schedule.moving_stage];
+    control->misalignment = misalignment_configure(&(misalignment_settings_t){
         .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
-        .control_rate_hz = control_rate_hz,
+        .control_rate_hz = rate_hz,
         .periods_per_update = DEFERRED_LEARNING_PERIODS,
         .periods_per_common_update = DEFERRED_COMMON_PERIODS,
         .inertia_q30 = inertia_q30,
         .phases = tables->phases,
         .rotor_poles = tables->rotor_poles,
-        .encoder_bits = encoder_bits,
-        .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[OBSERVER_BANDWIDTH_STEADY_STAGE],
+        .encoder_bits = from->encoder_bits,
+        .bandwidth_rad_s = bandwidth->stage[OBSERVER_BANDWIDTH_STEADY_STAGE].bandwidth_rad_s,
         .speed_exponent = tables->speed_exponent,
     });
-    control.moving_load = moving_load_configure(&(moving_load_settings_t){
-        .encoder_bits = encoder_bits,
-        .control_rate_hz = control_rate_hz,
+    control->moving_load = moving_load_configure(&(moving_load_settings_t){
+        .encoder_bits = from->encoder_bits,
+        .control_rate_hz = rate_hz,
         .periods_per_review = DEFERRED_SLOW_PERIODS,
-        .stages = OBSERVER_BANDWIDTH_STAGES - 1u - control.bandwidth.moving_stage,
-        .bandwidth_rad_s = control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage],
-        .trigger_ticks = control.bandwidth.end_ticks[control.bandwidth.trigger_stage_count],
+        .stages = OBSERVER_BANDWIDTH_STAGES - 1u - bandwidth->schedule.moving_stage,
+        .bandwidth_rad_s = moving->bandwidth_rad_s,
+        .trigger_ticks = bandwidth->stage[bandwidth->schedule.trigger_stage_count].end_ticks,
         .inertia_q30 = inertia_q30,
         .torque_max_q24 = torque_max_q24,
     });
-    control.slow_counts = slow_counts_configure(control_rate_hz, encoder_bits, inertia_q30);
-    control.count_course = count_course_configure(control.observer.angle_step_q32, encoder_bits);
     /* With a transducer the whole load is fed forward already. */
     const bool learns_load =
-        values[PARAMETER_PERIODIC_LOAD] != 0 && !control.load_from_transducer && control.moving_load.stages > 0;
-    control.periodic_load = periodic_load_configure(
-        control_rate_hz, learns_load ? control.bandwidth.bandwidth_rad_s[control.bandwidth.moving_stage] : 0,
-        torque_max_q24, tables->rotor_poles);
-    control.inertia = inertia_configure(&(inertia_settings_t){
-        .control_rate_hz = control_rate_hz,
+        values[PARAMETER_PERIODIC_LOAD] != 0 && !control->load_from_transducer && control->moving_load.stages > 0;
+    control->periodic_load = periodic_load_configure(rate_hz, learns_load ? moving->bandwidth_rad_s : 0, torque_max_q24,
+                                                     tables->rotor_poles);
+    control->inertia = inertia_configure(&(inertia_settings_t){
+        .control_rate_hz = rate_hz,
         .periods_per_update = DEFERRED_COMMON_PERIODS,
         .inertia_q30 = inertia_q30,
         .torque_max_q24 = torque_max_q24,
-        .encoder_bits = encoder_bits,
+        .encoder_bits = from->encoder_bits,
         .rotor_poles = tables->rotor_poles,
-        .reaching_gain_q24 = control.speed_smc.gain_q24,
-        .rate_q8 = control.misalignment.inertia_rate_q8,
+        .reaching_gain_q24 = control->speed_smc.gain_q24,
+        .rate_q8 = control->misalignment.inertia_rate_q8,
     });
-    control.torque_mode =
-        torque_mode_configure(values[PARAMETER_TORQUE_SLEW_RATE_NM_S], control_rate_hz, torque_min_q24, torque_max_q24,
-                              fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
-    control.speed_reference_max_q22 = speed_reference_max_q22(&control.torque_mode, tables);
-    control.torque_offset = torque_offset_configure(control_rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
-    control.encoder_monitor = encoder_monitor_from(&control, values, control_rate_hz);
-    control.table_scale_part_q31 = values[PARAMETER_TABLE_SCALE] != 0 ? table_scale_part_q31(control_rate_hz) : 0;
-    control.scale_by_shaft = values[PARAMETER_TABLE_SCALE] == 2;
+    control->slow_counts = slow_counts_configure(rate_hz, from->encoder_bits, inertia_q30);
+    control->count_course = count_course_configure(control->observer.angle_step_q32, from->encoder_bits);
+    control->stroke_mean = stroke_mean_configure(tables->phases, rate_hz / DEFERRED_SLOW_PERIODS);
+    control->torque_offset = torque_offset_configure(rate_hz / DEFERRED_SLOW_PERIODS, torque_max_q24);
+    control->table_scale_part_q31 = values[PARAMETER_TABLE_SCALE] != 0 ? table_scale_part_q31(rate_hz) : 0;
+    control->scale_by_shaft = values[PARAMETER_TABLE_SCALE] == 2;
+}
+
+/* After the laws, whose parameters they need. */
+static void set_monitors(control_parameters_t *control, const source_t *from) {
+    control->protection =
+        protection_from(from->values, control->observer.angle_step_q32, control->encoder_shift, from->control_rate_hz);
+    control->degraded = degraded_from(control, from->values);
+    control->encoder_monitor = encoder_monitor_from(control, from->values, from->control_rate_hz);
+}
+
+control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
+                                       uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
+                                       uint32_t timer_clock_hz) {
+    const controller_t controller = controller_from(parameters->values);
+    const source_t from = {
+        .values = parameters->values,
+        .tables = tables,
+        .control_rate_hz = control_rate_hz,
+        .encoder_bits = encoder_bits,
+        .adc_bits = adc_bits,
+        .timer_clock_hz = timer_clock_hz,
+        .controller = controller,
+        .torque_min_q24 = controller.four_quadrant ? -parameters->values[PARAMETER_TORQUE_MAX_NM] : 0,
+    };
+    control_parameters_t control = {.controller = (drive_controller_t)parameters->values[PARAMETER_CONTROLLER]};
+    set_sampling(&control, &from);
+    set_speed_control(&control, &from);
+    set_torque_control(&control, &from);
+    set_estimators(&control, &from);
+    set_monitors(&control, &from);
     return control;
 }
 
-static void tune_stage(observer_bandwidth_parameters_t *bandwidth, const observer_bandwidth_parameters_t *tuned,
-                       unsigned stage) {
-    bandwidth->gains[stage] = tuned->gains[stage];
-    bandwidth->bandwidth_rad_s[stage] = tuned->bandwidth_rad_s[stage];
-    bandwidth->end_ticks[stage] = tuned->end_ticks[stage];
-}
-
 COLD void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part) {
-    observer_bandwidth_parameters_t *bandwidth = &parameters->bandwidth;
-    if (part > 0) {
-        tune_stage(bandwidth, &tuned->bandwidth, part - 1);
+    switch (part) {
+    case CONFIGURE_TUNE_SPEED:
+        parameters->speed_pi = tuned->speed_pi;
+        parameters->speed_smc = tuned->speed_smc;
+        parameters->inertia = tuned->inertia;
+        parameters->moving_load = tuned->moving_load;
+        parameters->periodic_load = tuned->periodic_load;
+        parameters->bandwidth.schedule = tuned->bandwidth.schedule;
+        return;
+    case CONFIGURE_TUNE_TORQUE:
+        parameters->duty.pid = tuned->duty.pid;
+        parameters->predictive.flux = tuned->predictive.flux;
+        parameters->conduction = tuned->conduction;
+        parameters->misalignment = tuned->misalignment;
+        return;
+    default: { /* of the observer */
+        const unsigned stage = part - CONFIGURE_TUNE_FIRST_STAGE;
+        parameters->bandwidth.stage[stage] = tuned->bandwidth.stage[stage];
         return;
     }
-    parameters->speed_pi = tuned->speed_pi;
-    parameters->speed_smc = tuned->speed_smc;
-    parameters->duty.pid = tuned->duty.pid;
-    parameters->predictive.flux = tuned->predictive.flux;
-    parameters->conduction.gain_per_step_q16 = tuned->conduction.gain_per_step_q16;
-    parameters->moving_load = tuned->moving_load;
-    parameters->misalignment.noise_q22 = tuned->misalignment.noise_q22;
-    parameters->periodic_load = tuned->periodic_load;
-    parameters->inertia = tuned->inertia;
-    bandwidth->retrigger_holdoff_ticks = tuned->bandwidth.retrigger_holdoff_ticks;
-    bandwidth->holdoff_decay_q32 = tuned->bandwidth.holdoff_decay_q32;
-    bandwidth->threshold_count = tuned->bandwidth.threshold_count;
-    bandwidth->threshold_edge = tuned->bandwidth.threshold_edge;
-    bandwidth->mean_innovation_gain_q32 = tuned->bandwidth.mean_innovation_gain_q32;
-    bandwidth->threshold_error = tuned->bandwidth.threshold_error;
-    bandwidth->beat_step_min = tuned->bandwidth.beat_step_min;
-    bandwidth->beat_rounding_min_q4 = tuned->bandwidth.beat_rounding_min_q4;
-    bandwidth->edge_step_min = tuned->bandwidth.edge_step_min;
-    bandwidth->adaptive = tuned->bandwidth.adaptive;
-    bandwidth->trigger_stage_count = tuned->bandwidth.trigger_stage_count;
-    bandwidth->moving_stage = tuned->bandwidth.moving_stage;
-    bandwidth->steady_stage_edge = tuned->bandwidth.steady_stage_edge;
+    }
 }

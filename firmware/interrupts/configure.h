@@ -25,12 +25,19 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
                                        uint32_t timer_clock_hz);
 
-/* What the tunable parameters alone determine is taken over in parts, so that no interrupt waits for all of it: that of
- * the laws together, then each stage of the observer's bandwidth. */
-#define CONFIGURE_TUNE_PARTS (1 + OBSERVER_BANDWIDTH_STAGES)
+/* Parts in which a run takes over tuned parameters, so that no interrupt waits for all of them: laws of speed and load,
+ * laws of torque, then each stage of the observer's bandwidth. */
+enum {
+    CONFIGURE_TUNE_SPEED,
+    CONFIGURE_TUNE_TORQUE,
+    CONFIGURE_TUNE_FIRST_STAGE,
+    CONFIGURE_TUNE_PARTS = CONFIGURE_TUNE_FIRST_STAGE + OBSERVER_BANDWIDTH_STAGES
+};
 
 /* Takes over a part from the control parameters of a set that differs in nothing else than tunable parameters
- * (parameters.h). [background, in a critical section] */
+ * (parameters.h): every law that depends on one of them, as a whole, so that no member can be forgotten; members that
+ * depend on others are equal in both. After CONFIGURE_TUNE_SPEED follows deferred_tune() in the same critical section.
+ * [background, in a critical section] */
 void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part);
 
 #endif

@@ -106,7 +106,7 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->torque_reference_q24 = state->torque_reference_q24;
     input->electrical = measured->commutation.electrical;
     input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
-    if (parameters->bandwidth.adaptive) {
+    if (parameters->bandwidth.schedule.adaptive) {
         hand_over_bandwidth(state, input);
     }
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
@@ -165,15 +165,15 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
     const uint32_t withheld =
         moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation, rounding_q4,
                          sample->from_edge, sample->trigger != OBSERVER_TRIGGER_NONE, deferred->periodic_load.engaged);
-    observer_bandwidth_update(&parameters->bandwidth, &deferred->bandwidth, sample, angle_step, rounding_q4, withheld,
-                              limits);
+    observer_bandwidth_update(&parameters->bandwidth.schedule, &deferred->bandwidth, sample, angle_step, rounding_q4,
+                              withheld, limits);
 }
 
 /* Between slow counts there is nothing of which statistics could be made. */
 NOINLINE static bool follow_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                         const deferred_input_t *input, deferred_results_t *results) {
-    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.retrigger_holdoff_ticks, 1,
-                                                       parameters->bandwidth.trigger_stage_count};
+    results->bandwidth = (observer_bandwidth_limits_t){0, parameters->bandwidth.schedule.retrigger_holdoff_ticks, 1,
+                                                       parameters->bandwidth.schedule.trigger_stage_count};
     if (!slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
                           fixed_magnitude(rotation(parameters, input)), input->periods)) {
         return false;
@@ -190,13 +190,14 @@ static void follow_innovation(const control_parameters_t *parameters, deferred_t
     results->slow_counts.slow = false;
     if (deferred->slow_counts.slow) {
         results->slow_counts.slow = follow_slow_counts(parameters, deferred, input, results);
-    } else if (parameters->bandwidth.adaptive) {
+    } else if (parameters->bandwidth.schedule.adaptive) {
         limit_bandwidth(parameters, deferred, input, &results->bandwidth);
     }
 }
 
 static bool disturbed(const control_parameters_t *parameters, const deferred_input_t *input) {
-    return parameters->bandwidth.adaptive && input->bandwidth.stage < parameters->bandwidth.moving_stage;
+    return parameters->bandwidth.schedule.adaptive &&
+           input->bandwidth.stage < parameters->bandwidth.schedule.moving_stage;
 }
 
 /* Beat of the counts (observer_bandwidth.h), whose sawtooth may be as slow as the strokes. */
@@ -269,7 +270,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
                  (uint32_t)deferred->misalignment.phase[phase].offset - lag,
         .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
-        .bandwidth_rad_s = parameters->bandwidth.bandwidth_rad_s[input->bandwidth.stage],
+        .bandwidth_rad_s = parameters->bandwidth.stage[input->bandwidth.stage].bandwidth_rad_s,
         .condition = condition(deferred, undisturbed_speed_control(parameters, deferred, input)),
         .flux_misalignment = flux_misalignment[phase],
     };

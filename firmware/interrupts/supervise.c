@@ -34,7 +34,8 @@ NOINLINE static void end_run(const control_parameters_t *parameters, control_sta
 
 /* As wide as after its reset, the observer takes the first coarse counts of a turning rotor for a load. */
 static void await_load(const control_parameters_t *parameters, control_state_t *state) {
-    if (parameters->bandwidth.adaptive && state->bandwidth.stage < parameters->bandwidth.trigger_stage_count) {
+    if (parameters->bandwidth.schedule.adaptive &&
+        state->bandwidth.stage < parameters->bandwidth.schedule.trigger_stage_count) {
         state->observer.load_torque_q24 = 0;
     }
 }

@@ -320,7 +320,7 @@ TEST(SalientClosedLoop, with_three_times_the_inertia_the_observer_is_at_its_stea
     unsigned in_transient = 0, periods = 0;
     for (double at_s = 0.8; at_s < 1.3; at_s += 25e-6, periods++) {
         bench.run_until(at_s);
-        in_transient += bench.drive.state.bandwidth.stage < bench.drive.parameters.bandwidth.steady_stage_edge;
+        in_transient += bench.drive.state.bandwidth.stage < bench.drive.parameters.bandwidth.schedule.steady_stage_edge;
     }
     const double ripple = bench.trace.ripple(0.8, 1.3);
     std::printf("%-20s three times the inertia: in_transient %.2f %% of the time, ripple %.4f\n", machine_plant.name,

@@ -198,7 +198,7 @@ TEST_F(Comms, signals_carry_the_state_of_the_drive) {
     }
     control.predictive.torque_shortfall_q24 = INT32_MAX;
     control.deferred.conduction.single_pulse = true;
-    p.bandwidth.bandwidth_rad_s[control.bandwidth.stage] = 8000;
+    p.bandwidth.stage[control.bandwidth.stage].bandwidth_rad_s = 8000;
     drive.used_ticks = 3000;
     drive.worst_ticks = 4999;
     p.period_ticks = 2500;

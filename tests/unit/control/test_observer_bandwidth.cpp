@@ -43,15 +43,15 @@ class Bandwidth {
         : parameters(p), model(reference_model::model_of(p, rate_hz)) {
         observer_bandwidth_reset(&state);
         limits.withheld_stages = 1; // no beat
-        limits.holdoff_ticks = p.retrigger_holdoff_ticks;
+        limits.holdoff_ticks = p.schedule.retrigger_holdoff_ticks;
     }
 
     // One sample of both; true when the firmware triggered.
     bool step(int32_t innovation, bool from_edge = false) {
         const load_observer_gains_t *gains =
             observer_bandwidth_step(&parameters, &state, &limits, innovation, &from_edge);
-        EXPECT_EQ(gains, &parameters.gains[parameters.adaptive ? state.stage : LAST_STAGE]);
-        const bool triggered = parameters.adaptive && state.ticks == 0;
+        EXPECT_EQ(gains, &parameters.stage[parameters.schedule.adaptive ? state.stage : LAST_STAGE].gains);
+        const bool triggered = parameters.schedule.adaptive && state.ticks == 0;
         EXPECT_TRUE(!triggered || state.trigger != OBSERVER_TRIGGER_NONE);
         if (updating) {
             update(innovation, from_edge);
@@ -64,11 +64,13 @@ class Bandwidth {
     void update(int32_t innovation, bool from_edge) {
         const observer_bandwidth_sample_t sample = {
             .innovation = innovation, .from_edge = from_edge, .stage = state.stage, .trigger = state.trigger};
-        observer_bandwidth_update(&parameters, &statistics, &sample, angle_step, rounding_q4, 0, &limits);
+        observer_bandwidth_update(&parameters.schedule, &statistics, &sample, angle_step, rounding_q4, 0, &limits);
         state.trigger = OBSERVER_TRIGGER_NONE;
     }
 
-    bool steady() const { return !parameters.adaptive || state.stage >= parameters.steady_stage_edge; }
+    bool steady() const {
+        return !parameters.schedule.adaptive || state.stage >= parameters.schedule.steady_stage_edge;
+    }
 
     void settle(bool from_edge = false) {
         while (!steady()) {
@@ -76,7 +78,7 @@ class Bandwidth {
         }
     }
 
-    double rad_s() const { return parameters.bandwidth_rad_s[state.stage]; }
+    double rad_s() const { return parameters.stage[state.stage].bandwidth_rad_s; }
 
     observer_bandwidth_parameters_t parameters;
     observer_bandwidth_t state{};
@@ -113,14 +115,14 @@ TEST(ObserverBandwidth, decays_as_5_over_time_within_11_percent_from_the_transie
 TEST(ObserverBandwidth, every_stage_has_the_gains_of_its_bandwidth) {
     const observer_bandwidth_parameters_t p = configure();
     for (unsigned stage = 0; stage < OBSERVER_BANDWIDTH_STAGES; stage++) {
-        const load_observer_gains_t gains = load_observer_gains(p.bandwidth_rad_s[stage], RATE_HZ, INERTIA_Q30);
-        EXPECT_EQ(p.gains[stage].angle_gain_q28, gains.angle_gain_q28);
-        EXPECT_EQ(p.gains[stage].speed_gain_q24, gains.speed_gain_q24);
-        EXPECT_EQ(p.gains[stage].load_gain_q28, gains.load_gain_q28);
-        EXPECT_EQ(p.gains[stage].load_factor_q4, gains.load_factor_q4);
+        const load_observer_gains_t gains = load_observer_gains(p.stage[stage].bandwidth_rad_s, RATE_HZ, INERTIA_Q30);
+        EXPECT_EQ(p.stage[stage].gains.angle_gain_q28, gains.angle_gain_q28);
+        EXPECT_EQ(p.stage[stage].gains.speed_gain_q24, gains.speed_gain_q24);
+        EXPECT_EQ(p.stage[stage].gains.load_gain_q28, gains.load_gain_q28);
+        EXPECT_EQ(p.stage[stage].gains.load_factor_q4, gains.load_factor_q4);
         if (stage > 0 && stage < STEADY_STAGE) {
-            EXPECT_NEAR(p.bandwidth_rad_s[stage], p.bandwidth_rad_s[stage - 1] * 13.0 / 16.0, 2.0);
-            EXPECT_GT(p.end_ticks[stage], p.end_ticks[stage - 1]);
+            EXPECT_NEAR(p.stage[stage].bandwidth_rad_s, p.stage[stage - 1].bandwidth_rad_s * 13.0 / 16.0, 2.0);
+            EXPECT_GT(p.stage[stage].end_ticks, p.stage[stage - 1].end_ticks);
         }
     }
 }
@@ -128,11 +130,11 @@ TEST(ObserverBandwidth, every_stage_has_the_gains_of_its_bandwidth) {
 TEST(ObserverBandwidth, a_narrow_schedule_ends_early_and_stays_at_the_steady_bandwidth) {
     const observer_bandwidth_parameters_t p = configure(STEADY_RAD_S * 2);
     for (unsigned stage = 0; stage < LAST_STAGE; stage++) {
-        EXPECT_GE(p.bandwidth_rad_s[stage], STEADY_RAD_S);
+        EXPECT_GE(p.stage[stage].bandwidth_rad_s, STEADY_RAD_S);
     }
-    EXPECT_EQ(p.bandwidth_rad_s[0], STEADY_RAD_S * 2);
-    EXPECT_EQ(p.bandwidth_rad_s[4], STEADY_RAD_S);
-    EXPECT_EQ(p.bandwidth_rad_s[STEADY_STAGE], STEADY_RAD_S);
+    EXPECT_EQ(p.stage[0].bandwidth_rad_s, STEADY_RAD_S * 2);
+    EXPECT_EQ(p.stage[4].bandwidth_rad_s, STEADY_RAD_S);
+    EXPECT_EQ(p.stage[STEADY_STAGE].bandwidth_rad_s, STEADY_RAD_S);
 }
 
 TEST(ObserverBandwidth, an_innovation_above_1_25_counts_or_8_urad_of_an_edge_triggers_and_a_smaller_one_does_not) {
@@ -151,8 +153,8 @@ TEST(ObserverBandwidth, an_innovation_above_1_25_counts_or_8_urad_of_an_edge_tri
         }
     }
     const observer_bandwidth_parameters_t ideal = configure(TRANSIENT_RAD_S, RATE_HZ, 32);
-    EXPECT_NEAR(ideal.threshold_count / urad, 0.3, 0.01) << "an ideal encoder";
-    EXPECT_EQ(ideal.trigger_stage_count, 0) << "triggers the full transient bandwidth";
+    EXPECT_NEAR(ideal.schedule.threshold_count / urad, 0.3, 0.01) << "an ideal encoder";
+    EXPECT_EQ(ideal.schedule.trigger_stage_count, 0) << "triggers the full transient bandwidth";
 }
 
 TEST(ObserverBandwidth, equal_transient_and_steady_bandwidths_never_trigger) {
@@ -255,9 +257,9 @@ double count_Nm(double rad_s, unsigned bits) {
 TEST(ObserverBandwidth, no_stage_is_wider_than_the_encoder_allows_and_the_next_wider_one_would_be) {
     for (unsigned bits = 8; bits <= 15; bits++) {
         const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, bits);
-        const auto largest_Nm = [&](unsigned stage) { return count_Nm(p.bandwidth_rad_s[stage], bits); };
-        const unsigned trigger = p.trigger_stage_count, moving = p.moving_stage;
-        const unsigned steady_rad_s = p.bandwidth_rad_s[STEADY_STAGE];
+        const auto largest_Nm = [&](unsigned stage) { return count_Nm(p.stage[stage].bandwidth_rad_s, bits); };
+        const unsigned trigger = p.schedule.trigger_stage_count, moving = p.schedule.moving_stage;
+        const unsigned steady_rad_s = p.stage[STEADY_STAGE].bandwidth_rad_s;
         EXPECT_LE(trigger, moving);
         EXPECT_TRUE(trigger == STEADY_STAGE || largest_Nm(trigger) <= TORQUE_MAX_NM * 0.63) << bits;
         EXPECT_GT(largest_Nm(trigger - 1), TORQUE_MAX_NM * 0.62) << bits;
@@ -269,11 +271,11 @@ TEST(ObserverBandwidth, no_stage_is_wider_than_the_encoder_allows_and_the_next_w
 
 TEST(ObserverBandwidth, a_fine_encoder_keeps_the_bandwidths_of_the_settings) {
     const observer_bandwidth_parameters_t p = configure();
-    EXPECT_EQ(configure(TRANSIENT_RAD_S, RATE_HZ, 19).trigger_stage_count, 3) << "coarser than edges";
-    EXPECT_EQ(p.bandwidth_rad_s[STEADY_STAGE], STEADY_RAD_S);
-    EXPECT_EQ(p.steady_stage_edge, STEADY_STAGE);
-    EXPECT_LE(p.bandwidth_rad_s[p.moving_stage], MOVING_RAD_S);
-    EXPECT_GT(p.bandwidth_rad_s[p.moving_stage - 1], MOVING_RAD_S);
+    EXPECT_EQ(configure(TRANSIENT_RAD_S, RATE_HZ, 19).schedule.trigger_stage_count, 3) << "coarser than edges";
+    EXPECT_EQ(p.stage[STEADY_STAGE].bandwidth_rad_s, STEADY_RAD_S);
+    EXPECT_EQ(p.schedule.steady_stage_edge, STEADY_STAGE);
+    EXPECT_LE(p.stage[p.schedule.moving_stage].bandwidth_rad_s, MOVING_RAD_S);
+    EXPECT_GT(p.stage[p.schedule.moving_stage - 1].bandwidth_rad_s, MOVING_RAD_S);
 }
 
 TEST(ObserverBandwidth, withheld_stages_are_left_at_once_and_not_entered) {
@@ -305,9 +307,9 @@ TEST(ObserverBandwidth, rare_edges_of_a_coarse_encoder_count_as_counts_and_frequ
         for (uint32_t k = 0; k < RATE_HZ; k++) {
             bandwidth.step(0, true);
         }
-        EXPECT_EQ(bandwidth.state.stage, frequent ? p.steady_stage_edge : STEADY_STAGE);
+        EXPECT_EQ(bandwidth.state.stage, frequent ? p.schedule.steady_stage_edge : STEADY_STAGE);
         EXPECT_EQ(bandwidth.step(int32_t(count), true), frequent);
-        EXPECT_EQ(bandwidth.limits.trigger_stage_edge, frequent ? 0 : p.trigger_stage_count);
+        EXPECT_EQ(bandwidth.limits.trigger_stage_edge, frequent ? 0 : p.schedule.trigger_stage_count);
     }
 }
 
@@ -325,7 +327,7 @@ double rad_s_after_a_second(unsigned bits, double counts, double rounding, bool 
 }
 
 TEST(ObserverBandwidth, a_beat_of_the_rounding_narrows_the_steady_bandwidth_and_nothing_else_does) {
-    const double beat_rad_s = configure(TRANSIENT_RAD_S, RATE_HZ, 15).bandwidth_rad_s[LAST_STAGE];
+    const double beat_rad_s = configure(TRANSIENT_RAD_S, RATE_HZ, 15).stage[LAST_STAGE].bandwidth_rad_s;
     EXPECT_LT(beat_rad_s, STEADY_RAD_S * 0.6);
     EXPECT_EQ(rad_s_after_a_second(15, 3.0, 0.5, false), beat_rad_s);
     EXPECT_EQ(rad_s_after_a_second(15, 3.0, 1.0 / 23.0, false), beat_rad_s);
@@ -338,7 +340,8 @@ TEST(ObserverBandwidth, a_beat_of_the_rounding_narrows_the_steady_bandwidth_and_
 TEST(ObserverBandwidth, in_a_beat_a_count_is_worth_at_least_a_512th_of_the_torque) {
     for (unsigned bits = 8; bits <= 32; bits++) {
         const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, bits);
-        const unsigned beat_rad_s = p.bandwidth_rad_s[LAST_STAGE], steady_rad_s = p.bandwidth_rad_s[STEADY_STAGE];
+        const unsigned beat_rad_s = p.stage[LAST_STAGE].bandwidth_rad_s,
+                       steady_rad_s = p.stage[STEADY_STAGE].bandwidth_rad_s;
         EXPECT_LE(beat_rad_s, steady_rad_s) << bits;
         EXPECT_GE(beat_rad_s, 100u) << bits;
         if (beat_rad_s < steady_rad_s) {
@@ -358,13 +361,13 @@ TEST(ObserverBandwidth, a_trigger_ends_the_bandwidth_of_a_beat_and_the_decay_ret
     }
     ASSERT_EQ(bandwidth.state.stage, LAST_STAGE);
     EXPECT_TRUE(bandwidth.step(2 << 18));
-    EXPECT_EQ(bandwidth.state.stage, p.trigger_stage_count);
+    EXPECT_EQ(bandwidth.state.stage, p.schedule.trigger_stage_count);
     uint32_t periods = 0;
     while (bandwidth.state.stage < LAST_STAGE) {
         bandwidth.step(0);
         ASSERT_LT(++periods, RATE_HZ);
     }
-    EXPECT_NEAR(periods / double(RATE_HZ), 5.5 / p.bandwidth_rad_s[LAST_STAGE], 1e-3);
+    EXPECT_NEAR(periods / double(RATE_HZ), 5.5 / p.stage[LAST_STAGE].bandwidth_rad_s, 1e-3);
 }
 
 // Error of a schedule a / t: d(angle) = w - 3 w0 e, dw = L - 3 w0^2 e, dL = -w0^3 e, with the load step at t = 1.2 ms.

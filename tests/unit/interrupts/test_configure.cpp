@@ -240,11 +240,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const bool schedules = p.values[PARAMETER_CONTROLLER] != DRIVE_CONTROLLER_TRADITIONAL;
     const auto set_rad_s =
         uint32_t(p.values[schedules ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S]);
-    const uint32_t steady_rad_s = c.bandwidth.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
+    const uint32_t steady_rad_s = c.bandwidth.stage[OBSERVER_BANDWIDTH_STAGES - 1].bandwidth_rad_s;
     ASSERT_LE(steady_rad_s, set_rad_s);
-    ASSERT_TRUE(steady_rad_s == set_rad_s || c.bandwidth.adaptive) << "limited to what the encoder allows";
+    ASSERT_TRUE(steady_rad_s == set_rad_s || c.bandwidth.schedule.adaptive) << "limited to what the encoder allows";
     const load_observer_gains_t gains = load_observer_gains(steady_rad_s, rate, inertia_q30);
-    const load_observer_gains_t &steady = c.bandwidth.gains[OBSERVER_BANDWIDTH_STAGES - 1];
+    const load_observer_gains_t &steady = c.bandwidth.stage[OBSERVER_BANDWIDTH_STAGES - 1].gains;
     ASSERT_EQ(steady.angle_gain_q28, gains.angle_gain_q28);
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
     ASSERT_EQ(steady.load_gain_q28, gains.load_gain_q28);
@@ -254,9 +254,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const parameter_index_t widest = wakes       ? PARAMETER_OBSERVER_WAKE_RAD_S
                                      : schedules ? PARAMETER_OBSERVER_STEADY_RAD_S
                                                  : PARAMETER_OBSERVER_BANDWIDTH_RAD_S;
-    ASSERT_EQ(c.bandwidth.bandwidth_rad_s[0], p.values[widest]);
-    ASSERT_EQ(c.bandwidth.threshold_count == UINT32_MAX, !wakes);
-    ASSERT_EQ(c.bandwidth.threshold_edge == UINT32_MAX, !wakes);
+    ASSERT_EQ(c.bandwidth.stage[0].bandwidth_rad_s, p.values[widest]);
+    ASSERT_EQ(c.bandwidth.schedule.threshold_count == UINT32_MAX, !wakes);
+    ASSERT_EQ(c.bandwidth.schedule.threshold_edge == UINT32_MAX, !wakes);
     ASSERT_EQ(c.observer.acceleration_q32, observer.acceleration_q32);
     ASSERT_EQ(c.observer.friction_q30, observer.friction_q30);
 }

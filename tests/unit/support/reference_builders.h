@@ -45,15 +45,15 @@ inline observer_t model_of(const load_observer_gains_t &gains, const load_observ
 
 inline bandwidth_t model_of(const observer_bandwidth_parameters_t &p, double rate_hz) {
     bandwidth_t bandwidth{};
-    bandwidth.steady_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STEADY_STAGE];
-    bandwidth.beat_rad_s = p.bandwidth_rad_s[OBSERVER_BANDWIDTH_STAGES - 1];
-    bandwidth.count_trigger_rad_s = p.bandwidth_rad_s[p.trigger_stage_count];
-    bandwidth.edge_trigger_rad_s = p.bandwidth_rad_s[0];
+    bandwidth.steady_rad_s = p.stage[OBSERVER_BANDWIDTH_STEADY_STAGE].bandwidth_rad_s;
+    bandwidth.beat_rad_s = p.stage[OBSERVER_BANDWIDTH_STAGES - 1].bandwidth_rad_s;
+    bandwidth.count_trigger_rad_s = p.stage[p.schedule.trigger_stage_count].bandwidth_rad_s;
+    bandwidth.edge_trigger_rad_s = p.stage[0].bandwidth_rad_s;
     bandwidth.rate_hz = rate_hz;
-    bandwidth.threshold_count = p.threshold_count / fixed_point::REV;
-    bandwidth.threshold_edge = p.threshold_edge / fixed_point::REV;
-    bandwidth.holdoff_s = p.retrigger_holdoff_ticks / rate_hz;
-    bandwidth.holdoff_decay = p.holdoff_decay_q32 / fixed_point::Q32;
+    bandwidth.threshold_count = p.schedule.threshold_count / fixed_point::REV;
+    bandwidth.threshold_edge = p.schedule.threshold_edge / fixed_point::REV;
+    bandwidth.holdoff_s = p.schedule.retrigger_holdoff_ticks / rate_hz;
+    bandwidth.holdoff_decay = p.schedule.holdoff_decay_q32 / fixed_point::Q32;
     return bandwidth;
 }
 

@@ -121,7 +121,8 @@ class salient_t {
         bandwidth = model_of(p.bandwidth, rate_hz);
         moving_load[0] = model_of(p.moving_load, false, rate_hz);
         moving_load[1] = model_of(p.moving_load, true, rate_hz);
-        std::copy(std::begin(p.bandwidth.bandwidth_rad_s), std::end(p.bandwidth.bandwidth_rad_s), stage_rad_s.begin());
+        std::transform(std::begin(p.bandwidth.stage), std::end(p.bandwidth.stage), stage_rad_s.begin(),
+                       [](const observer_bandwidth_stage_t &stage) { return stage.bandwidth_rad_s; });
         offset_limit = torque_max / 8.0;
         predictive = model_of(p.predictive, p.conduction, &machine, phases);
         predictive.period_s = 1.0 / rate_hz;
