@@ -8,8 +8,8 @@
 #define MEAN_1_S 10
 #define FILTER_GAIN_MAX_Q16 65535 /* largest below one */
 #define SETTLE_MS 150
-/* 1.2 s. */
-#define DISTRUST_SHIFT 3
+/* Settling time x 8, 1.2 s, after a contradiction. */
+#define CONTRADICTED_SHIFT 3
 #define TORQUE_MIN_Q24 (1u << 24)
 /* 0.05 * 0.02^2 of T^2, Q32: keeps the denominator above the noise of s_j. */
 #define POWER_FLOOR_Q32 (21 << 12)
@@ -17,7 +17,7 @@
 /* Error that a step corrects, 0.08 rad: a load step teaches little before the end of its stroke, where learning stops.
  */
 #define STEP_MAX_Q10 (4 << 10)
-/* The mean of the square of the sum: 25 ms at 40 kHz, updates every 8 periods. */
+/* Mean of the square of the sum: 25 ms at 40 kHz, updates every 8 periods. */
 #define COMMON_POWER_SHIFT 8
 /* Its rate is half of the phases': the sum is smaller than its parts, and the noise is not. */
 #define COMMON_SLOWER 2
@@ -117,9 +117,71 @@ static inline int32_t growing_mean_q16(const misalignment_parameters_t *paramete
     return gain_q16 > parameters->mean_q16 ? gain_q16 : parameters->mean_q16;
 }
 
-/* Step of a phase by the errors since its last one. */
-static inline int32_t phase_step_q10(const misalignment_t *misalignment, int32_t error_q24, int32_t alternating_q24,
-                                     int32_t torque_q24) {
+/* The phase to update; the next one is that of the next step. */
+static inline misalignment_phase_t *take_phase(misalignment_t *misalignment, const machine_tables_t *tables) {
+    const unsigned index = misalignment->phase_index;
+    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
+    misalignment_phase_t *phase = &misalignment->phase[index];
+    IN_REGISTER(phase);
+    return phase;
+}
+
+static inline int32_t flux_error(const misalignment_phase_t *phase, int32_t flux_misalignment) {
+    return flux_misalignment != 0 ? fixed_subtract(flux_misalignment, phase->offset) : 0;
+}
+
+/* Counts the steady updates, and decides whether the ripple teaches in this one. True if the state had settled before
+ * it. */
+static inline bool settle(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                          const misalignment_sample_t *sample, int32_t error) {
+    const bool torque_suffices = fixed_magnitude(sample->torque_q24) > TORQUE_MIN_Q24;
+    const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
+    const bool contradicted = fixed_magnitude(error) > parameters->probe_angle / 2;
+    const bool settled = misalignment->steady_updates >= parameters->settle_updates
+                                                             << (misalignment->contradicted ? CONTRADICTED_SHIFT : 0);
+    if (steady) {
+        misalignment->steady_updates += !settled;
+    } else if (sample->condition == MISALIGNMENT_UNSTEADY) {
+        misalignment->steady_updates = 0;
+    }
+    if (settled) {
+        misalignment->contradicted = contradicted;
+        misalignment->steady_updates = contradicted ? 0 : misalignment->steady_updates;
+    }
+    misalignment->learning = steady && settled && !contradicted;
+    return settled;
+}
+
+/* Slope of the phase as y shows it, its alternating part, N m per 0.02 rad, Q7.24; means of y and of the slopes' power.
+ * One phase per update stands for all: the sum over the phases. */
+static inline int32_t filter_slopes(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
+                                    misalignment_phase_t *phase, const machine_tables_t *tables,
+                                    const misalignment_sample_t *sample, int32_t mean_gain_q16) {
+    phase->slope_q24 = slope_at_q24(parameters, tables, sample->angle, sample->current_q9);
+    const int32_t filter_q16 = fixed_clamp(
+        fixed_multiply_high((int32_t)(sample->bandwidth_rad_s << 16), parameters->filter_q32), 0, FILTER_GAIN_MAX_Q16);
+    low_pass_step(&phase->slope_lag1_q24, phase->slope_q24, filter_q16);
+    low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, filter_q16);
+    low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);
+    const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
+    const int32_t phase_power_q24 = square_q24(alternating_q24);
+    int32_t power_q24 = 0;
+    UNROLL(4)
+    for (unsigned i = 0; i < tables->phases; i++) {
+        power_q24 = fixed_add(power_q24, phase_power_q24);
+    }
+    const int32_t gain_q16 = mean_gain_q16 / (int32_t)tables->phases + 1;
+    low_pass_step(&misalignment->power_q24, power_q24, gain_q16);
+    low_pass_step(&misalignment->disturbance_mean_q24, sample->disturbance_q24, gain_q16);
+    return alternating_q24;
+}
+
+/* Step of a phase by least mean squares, 0.02 rad, Q10. disturbances_q24: sum of y since its last update, of at most
+ * four, 32 bits each. */
+static inline int32_t lms_step_q10(const misalignment_t *misalignment, int64_t disturbances_q24,
+                                   int32_t alternating_q24, int32_t torque_q24, int32_t phases) {
+    const int32_t recent_mean_q24 = 4 * ((int32_t)(disturbances_q24 >> 2) / phases);
+    const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
     const int32_t floor_q24 = fixed_multiply_high(square_q24(torque_q24), POWER_FLOOR_Q32);
     const int32_t denominator_q20 = (fixed_add(misalignment->power_q24, floor_q24) >> 4) + 1;
     /* Q24 * Q24 to Q30, divided by Q20: Q10. */
@@ -128,64 +190,24 @@ static inline int32_t phase_step_q10(const misalignment_t *misalignment, int32_t
 
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample) {
-    const bool torque_suffices = fixed_magnitude(sample->torque_q24) > TORQUE_MIN_Q24;
-    const bool steady = sample->condition == MISALIGNMENT_STEADY && torque_suffices;
-    const int32_t disturbance_q24 = sample->disturbance_q24;
-    const unsigned index = misalignment->phase_index;
-    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
-    misalignment_phase_t *phase = &misalignment->phase[index];
-    IN_REGISTER(phase);
-    const int32_t flux_error =
-        sample->flux_misalignment != 0 ? fixed_subtract(sample->flux_misalignment, phase->offset) : 0;
-    const bool contradicted = fixed_magnitude(flux_error) > parameters->probe_angle / 2;
-    const bool settled = misalignment->steady_updates >= parameters->settle_updates
-                                                             << (misalignment->distrusted ? DISTRUST_SHIFT : 0);
-    if (steady) {
-        misalignment->steady_updates += !settled;
-    } else if (sample->condition == MISALIGNMENT_UNSTEADY) {
-        misalignment->steady_updates = 0;
-    }
-    if (settled) {
-        misalignment->distrusted = contradicted;
-        misalignment->steady_updates = contradicted ? 0 : misalignment->steady_updates;
-    }
-    const bool learning = steady && settled && !contradicted;
-    misalignment->learning = learning;
+    misalignment_phase_t *phase = take_phase(misalignment, tables);
     const int32_t phases = (int32_t)tables->phases;
+    const int32_t error = flux_error(phase, sample->flux_misalignment);
+    const bool settled = settle(parameters, misalignment, sample, error);
     const int32_t mean_gain_q16 =
         settled ? parameters->mean_q16 : growing_mean_q16(parameters, misalignment->steady_updates, phases);
-
-    misalignment->disturbance_sum_q24 += disturbance_q24;
-    const int64_t sum_before_q24 = phase->last_sum_q24;
+    misalignment->disturbance_sum_q24 += sample->disturbance_q24;
+    const int64_t disturbances_q24 = misalignment->disturbance_sum_q24 - phase->last_sum_q24;
     phase->last_sum_q24 = misalignment->disturbance_sum_q24;
-    const int32_t slope_q24 = slope_at_q24(parameters, tables, sample->angle, sample->current_q9);
-    phase->slope_q24 = slope_q24;
-    const int32_t filter_q16 = fixed_clamp(
-        fixed_multiply_high((int32_t)(sample->bandwidth_rad_s << 16), parameters->filter_q32), 0, FILTER_GAIN_MAX_Q16);
-    low_pass_step(&phase->slope_lag1_q24, slope_q24, filter_q16);
-    low_pass_step(&phase->slope_lag2_q24, phase->slope_lag1_q24, filter_q16);
-    low_pass_step(&phase->slope_mean_q24, phase->slope_lag2_q24, mean_gain_q16);
-    const int32_t alternating_q24 = fixed_subtract(phase->slope_lag2_q24, phase->slope_mean_q24);
-    /* One phase per update stands for all: the sum over the phases. */
-    const int32_t phase_power_q24 = square_q24(alternating_q24);
-    int32_t power_q24 = 0;
-    UNROLL(4)
-    for (unsigned i = 0; i < tables->phases; i++) {
-        power_q24 = fixed_add(power_q24, phase_power_q24);
-    }
-    low_pass_step(&misalignment->power_q24, power_q24, mean_gain_q16 / phases + 1);
-    low_pass_step(&misalignment->disturbance_mean_q24, disturbance_q24, mean_gain_q16 / phases + 1);
+    const int32_t alternating_q24 = filter_slopes(parameters, misalignment, phase, tables, sample, mean_gain_q16);
     int64_t step_q40 = misalignment->common_sum_q40 - phase->common_sum_q40;
     phase->common_sum_q40 = misalignment->common_sum_q40;
-    if (learning) {
-        /* Mean of y since the last update of the phase: at most four updates, 32 bits each. */
-        const int32_t recent_mean_q24 =
-            4 * ((int32_t)((misalignment->disturbance_sum_q24 - sum_before_q24) >> 2) / phases);
-        const int32_t error_q24 = fixed_subtract(recent_mean_q24, misalignment->disturbance_mean_q24);
-        const int32_t step_q10 = phase_step_q10(misalignment, error_q24, alternating_q24, sample->torque_q24);
+    if (misalignment->learning) {
+        const int32_t step_q10 =
+            lms_step_q10(misalignment, disturbances_q24, alternating_q24, sample->torque_q24, phases);
         step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
-    } else {
-        step_q40 = flux_step_q40(parameters, phase, flux_error);
+    } else { /* a last step of the common angle is dropped: the ripple teaches no longer */
+        step_q40 = flux_step_q40(parameters, phase, error);
     }
     add_to_offset(parameters, phase, step_q40);
 }
@@ -193,15 +215,11 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
 void misalignment_follow_flux(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                               const machine_tables_t *tables, uint32_t angle, int32_t current_q9,
                               int32_t flux_misalignment) {
-    const unsigned index = misalignment->phase_index;
-    misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
     misalignment->steady_updates = 0;
     misalignment->learning = false;
-    misalignment_phase_t *phase = &misalignment->phase[index];
-    IN_REGISTER(phase);
+    misalignment_phase_t *phase = take_phase(misalignment, tables);
     phase->slope_q24 = slope_at_q24(parameters, tables, angle, current_q9);
-    const int32_t error = flux_misalignment != 0 ? fixed_subtract(flux_misalignment, phase->offset) : 0;
-    add_to_offset(parameters, phase, flux_step_q40(parameters, phase, error));
+    add_to_offset(parameters, phase, flux_step_q40(parameters, phase, flux_error(phase, flux_misalignment)));
 }
 
 /* Part of a value around the frequency of the strokes. */

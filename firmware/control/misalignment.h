@@ -100,7 +100,7 @@ typedef struct {
     int64_t common_power_q40; /* mean of the band's (sum s_j / 4)^2, (N m per 0.02 rad)^2, Q40 */
     int64_t common_sum_q40;   /* of the steps of the common angle, which each phase takes with its next update */
     misalignment_band_t common_slope, common_disturbance; /* of sum s_j / 4, N m per 0.02 rad, and of y */
-    bool distrusted;      /* the ripple has taught what the flux linkage contradicts: learning waits for longer */
+    bool contradicted;    /* ripple estimate contradicts flux estimate: settling time x 8 */
     bool learning;        /* from the ripple, by the conditions of the last misalignment_step */
     unsigned phase_index; /* phase to update, in turn */
 } misalignment_t;

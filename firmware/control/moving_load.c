@@ -72,7 +72,7 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 /* A load that has been still long enough for a trend to be ripple: 156 ms or 0.5 s. */
 static bool still(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
     const uint32_t reviews = parameters->still_reviews;
-    return moving->still >= (moving->source == MOVING_LOAD_SOURCE_MORE ? reviews : reviews * 5 / 16);
+    return moving->still >= (moving->source == MOVING_LOAD_SOURCE_UNMODELLED ? reviews : reviews * 5 / 16);
 }
 
 /* A trend soon after the release of the first stage doubles the hold. */
@@ -83,7 +83,7 @@ static void withhold(const moving_load_parameters_t *parameters, moving_load_t *
         hold_ticks *= 2;
         if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
             if (moving->source == MOVING_LOAD_SOURCE_RIPPLE) {
-                moving->source = MOVING_LOAD_SOURCE_MORE;
+                moving->source = MOVING_LOAD_SOURCE_UNMODELLED;
                 moving->still = 0;
             } else {
                 moving->source = MOVING_LOAD_SOURCE_RIPPLE;

@@ -63,11 +63,11 @@ typedef struct {
     uint32_t stages;             /* to withhold; 0: no detection */
 } moving_load_parameters_t;
 
-/* What a trend is taken for. */
+/* Source that a trend is attributed to. */
 typedef enum {
-    MOVING_LOAD_SOURCE_LOAD,   /* a load that has moved lately */
-    MOVING_LOAD_SOURCE_RIPPLE, /* the drive's own: the threshold is 2.5 times its base value */
-    MOVING_LOAD_SOURCE_MORE,   /* than ripple, it has exceeded that too: the base value again */
+    MOVING_LOAD_SOURCE_LOAD,       /* a load that has moved lately: base threshold */
+    MOVING_LOAD_SOURCE_RIPPLE,     /* ripple of the drive: 2.5 times the base threshold */
+    MOVING_LOAD_SOURCE_UNMODELLED, /* larger than ripple, of a load that does not move: base threshold */
 } moving_load_source_t;
 
 /* All zero at the start. */
