@@ -7,6 +7,7 @@
 #include "drive_enumerations.h"
 #include "drive_telemetry.h"
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 static_assert((int)HAL_CAN_ERROR_ACTIVE == (int)BUS_STATE_ERROR_ACTIVE &&
                   (int)HAL_CAN_ERROR_PASSIVE == (int)BUS_STATE_ERROR_PASSIVE &&
@@ -31,7 +32,7 @@ COLD static void wait_in_bus_off(bus_monitor_t *monitor, hal_t *hal, uint32_t ti
     hal_can_rejoin(hal);
     monitor->since_us = time_us;
     const uint32_t doubled_us = 2 * monitor->wait_us;
-    monitor->wait_us = doubled_us < BUS_MONITOR_WAIT_MAX_US ? doubled_us : BUS_MONITOR_WAIT_MAX_US;
+    monitor->wait_us = fixed_min_u32(doubled_us, BUS_MONITOR_WAIT_MAX_US);
 }
 
 COLD void bus_monitor_step(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us) {

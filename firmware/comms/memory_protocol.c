@@ -2,6 +2,7 @@
 
 #include "comms/units.h"
 #include "drive_codec.h"
+#include "fixed/fixed.h"
 
 /* Parts of the responses, as drive.dbc lists them. */
 enum {
@@ -34,7 +35,7 @@ enum {
 static uint16_t largest(const uint16_t *current_q9) {
     uint16_t largest_q9 = 0;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        largest_q9 = current_q9[phase] > largest_q9 ? current_q9[phase] : largest_q9;
+        largest_q9 = (uint16_t)fixed_max_u32(current_q9[phase], largest_q9);
     }
     return largest_q9;
 }

@@ -6,6 +6,7 @@
 #include "drive_codec.h"
 #include "drive_enumerations.h"
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 /* The groups `background` and `idle` of any node have these, and no other frame of the drive. */
 #define BACKGROUND_IDENTIFIERS DRIVE_IDENTITY_FRAME_ID
@@ -33,7 +34,7 @@ COLD void telemetry_set_period(telemetry_t *telemetry, drive_telemetry_rate_t ra
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         if (drive_telemetry_messages[i].rate == rate) {
             const int left = telemetry->countdown[i] + longer;
-            telemetry->countdown[i] = (uint16_t)(left > 0 ? left : 0);
+            telemetry->countdown[i] = (uint16_t)fixed_max(left, 0);
         }
     }
     telemetry->period[rate] = (uint16_t)period;

@@ -61,7 +61,7 @@ static inline int32_t applied_flux_device_q29(const machine_tables_t *tables, in
 static inline int32_t applied_flux_voltage_error_q29(const machine_tables_t *tables, int32_t period_flux_q29,
                                                      int32_t period_q40) {
     const int32_t device_q29 = applied_flux_device_q29(tables, period_q40);
-    return device_q29 > period_flux_q29 / 64 ? device_q29 : period_flux_q29 / 64;
+    return fixed_max(device_q29, period_flux_q29 / 64);
 }
 
 /* Two independent errors together, >= 0: the larger one and a quarter of the other, within 12 % of the root of the sum

@@ -1,6 +1,7 @@
 #include "control/commutation.h"
 
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 /* 2^32 / phases as (2^32 - phases) / phases + 1, for a 32-bit division. */
 uint32_t commutation_stroke(unsigned phases) {
@@ -20,7 +21,7 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
         .turn_on = turn_on,
         /* Three strokes are one LSB short of a revolution: a window of one stroke is widened to close that gap. */
         .active_width = active == stroke ? stroke + 1 : active,
-        .available_width = available > active ? available : active,
+        .available_width = fixed_max_u32(available, active),
     };
 }
 

@@ -47,7 +47,7 @@ ditc_hysteresis_limit_t ditc_hysteresis_limit(const ditc_hysteresis_parameters_t
     const int32_t slow_q9 = limit_q9 - (limit_q9 >> 2);
     const int32_t fast_q9 =
         parameters->generating_limit_q9 - fixed_multiply_high(backwards_q22, parameters->generating_slope_q19);
-    return (ditc_hysteresis_limit_t){slow_q9 < fast_q9 ? slow_q9 : fast_q9, OFF};
+    return (ditc_hysteresis_limit_t){fixed_min(slow_q9, fast_q9), OFF};
 }
 
 static int32_t limit_current(ditc_hysteresis_limit_t limit, int32_t state, int32_t current_q9) {

@@ -11,6 +11,6 @@ int32_t flux_observer_step(const flux_observer_parameters_t *parameters, int32_t
     const int32_t resistive_drop_q29 = fixed_multiply_high(current_q9 << 12, parameters->resistance_period_q40);
     const int32_t next_q29 =
         fixed_add(fixed_add(*flux_q29, correction_q29), fixed_subtract(applied_q29, resistive_drop_q29));
-    *flux_q29 = next_q29 > 0 ? next_q29 : 0;
+    *flux_q29 = fixed_max(next_q29, 0);
     return resistive_drop_q29;
 }

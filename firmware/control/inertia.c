@@ -66,7 +66,7 @@ static int32_t scaled(int32_t value, int32_t k) {
         return value >> k;
     }
     const int32_t max = INT32_MAX >> -k;
-    return (value < max ? value : max) << -k;
+    return fixed_min(value, max) << -k;
 }
 
 static void set_laws(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {

@@ -100,8 +100,8 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
 }
 
 load_observer_inertia_t load_observer_inertia(const load_observer_model_t *model, int32_t k) {
-    const int32_t nominal_q32 = model->acceleration_q32, max_q32 = INT32_MAX >> (k > 0 ? k : 0);
-    const int32_t limited_q32 = nominal_q32 < max_q32 ? nominal_q32 : max_q32;
+    const int32_t nominal_q32 = model->acceleration_q32, max_q32 = INT32_MAX >> fixed_max(k, 0);
+    const int32_t limited_q32 = fixed_min(nominal_q32, max_q32);
     return (load_observer_inertia_t){
         .acceleration_q32 = k > 0 ? limited_q32 << k : limited_q32 >> -k,
         .load_shift = k + 2,

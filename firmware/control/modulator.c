@@ -1,6 +1,7 @@
 #include "control/modulator.h"
 
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 void modulate(const int32_t duty_q15[], unsigned phases, uint16_t period_ticks, bool interleaved,
               hal_pwm_compare_t *compare) {
@@ -14,7 +15,7 @@ void modulate(const int32_t duty_q15[], unsigned phases, uint16_t period_ticks, 
         const int32_t both =
             (duty_q15[phase] * period_ticks + (MODULATOR_DUTY_ONE_Q15 * period_ticks + rounding)) >> 15;
         const int32_t beyond = both - lower_alone;
-        const int32_t upper = (beyond > 0 ? beyond : 0) >> halving;
+        const int32_t upper = fixed_max(beyond, 0) >> halving;
         int32_t lower = both - upper;
         IN_REGISTER(lower); /* a difference of 32 bits, of which 16 are stored */
         compare->upper[phase] = (uint16_t)upper;

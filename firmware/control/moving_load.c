@@ -162,8 +162,8 @@ void moving_load_review(const moving_load_parameters_t *parameters, moving_load_
                         bool hold) {
     const int32_t load_q24 = moving->load_q24 + (fixed_subtract(load_torque_q24, moving->load_q24) >> LOAD_SHIFT);
     moving->load_q24 = load_q24;
-    moving->load_min_q24 = load_q24 < moving->load_min_q24 ? load_q24 : moving->load_min_q24;
-    moving->load_max_q24 = load_q24 > moving->load_max_q24 ? load_q24 : moving->load_max_q24;
+    moving->load_min_q24 = fixed_min(load_q24, moving->load_min_q24);
+    moving->load_max_q24 = fixed_max(load_q24, moving->load_max_q24);
     if (fixed_subtract(moving->load_max_q24, moving->load_min_q24) >= parameters->movement_min_q24) {
         moving->load_min_q24 = moving->load_max_q24 = load_q24;
         moving->still = 0;

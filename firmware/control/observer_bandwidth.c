@@ -142,7 +142,7 @@ void observer_bandwidth_reset(observer_bandwidth_t *bandwidth) {
 
 static uint32_t threshold_of(const observer_bandwidth_schedule_t *schedule, uint32_t threshold_mean, bool from_edge) {
     const uint32_t threshold_min = from_edge ? schedule->threshold_edge : schedule->threshold_count;
-    return threshold_mean > threshold_min ? threshold_mean : threshold_min;
+    return fixed_max_u32(threshold_mean, threshold_min);
 }
 
 static uint32_t threshold_of_mean(const observer_bandwidth_statistics_t *statistics) {
@@ -158,7 +158,7 @@ static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters
      */
     const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->stage[bandwidth->stage].end_ticks);
     const unsigned last = LAST_STAGE - limits->withheld_stages;
-    bandwidth->stage = next < last ? next : last;
+    bandwidth->stage = fixed_min_u32(next, last);
     if (fixed_magnitude(innovation) > threshold_of(&parameters->schedule, limits->threshold_mean, from_edge) &&
         bandwidth->ticks >= limits->holdoff_ticks) {
         bandwidth->trigger = bandwidth->stage >= parameters->schedule.steady_stage_edge
@@ -191,7 +191,7 @@ void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
         /* Innovations are clipped at the threshold, so that a load step does not raise it. */
         const uint32_t threshold = threshold_of(schedule, threshold_of_mean(statistics), sample->from_edge);
         const uint32_t magnitude = fixed_magnitude(sample->innovation);
-        const int32_t clipped = (int32_t)(magnitude < threshold ? magnitude : threshold);
+        const int32_t clipped = (int32_t)fixed_min_u32(magnitude, threshold);
         const int32_t mean = (int32_t)(statistics->mean_innovation_q32 >> 32);
         statistics->mean_innovation_q32 =
             fixed_accumulate(statistics->mean_innovation_q32, clipped - mean, schedule->mean_innovation_gain_q32);
@@ -200,8 +200,7 @@ void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
         const uint32_t growth_q16 =
             triggered_steady ? statistics->holdoff_extension_q16 : statistics->holdoff_extension_q16 / 4;
         const uint32_t extension_q16 = statistics->holdoff_extension_q16 + growth_q16 + HOLDOFF_INCREMENT_Q16;
-        statistics->holdoff_extension_q16 =
-            extension_q16 < HOLDOFF_EXTENSION_MAX_Q16 ? extension_q16 : HOLDOFF_EXTENSION_MAX_Q16;
+        statistics->holdoff_extension_q16 = fixed_min_u32(extension_q16, HOLDOFF_EXTENSION_MAX_Q16);
     }
     statistics->holdoff_extension_q16 =
         (uint32_t)(((uint64_t)statistics->holdoff_extension_q16 * schedule->holdoff_decay_q32) >> 32);
@@ -211,8 +210,8 @@ void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
     const uint32_t withheld_min = frequent_edges ? LAST_STAGE - schedule->steady_stage_edge : !beat;
     const uint32_t threshold_beat = beat ? rounding_q4 / 8 + schedule->threshold_error : 0;
     const uint32_t threshold_mean = threshold_of(schedule, threshold_of_mean(statistics), frequent_edges);
-    limits->threshold_mean = threshold_mean > threshold_beat ? threshold_mean : threshold_beat;
-    limits->withheld_stages = (uint8_t)(withheld_stages > withheld_min ? withheld_stages : withheld_min);
+    limits->threshold_mean = fixed_max_u32(threshold_mean, threshold_beat);
+    limits->withheld_stages = (uint8_t)fixed_max_u32(withheld_stages, withheld_min);
     limits->trigger_stage_edge = frequent_edges ? 0 : schedule->trigger_stage_count;
     limits->holdoff_ticks =
         schedule->retrigger_holdoff_ticks +

@@ -171,8 +171,8 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
 }
 
 static int32_t extended_q8(periodic_load_range_t *range, int32_t value_q8) {
-    range->least_q8 = value_q8 < range->least_q8 ? value_q8 : range->least_q8;
-    range->most_q8 = value_q8 > range->most_q8 ? value_q8 : range->most_q8;
+    range->least_q8 = fixed_min(value_q8, range->least_q8);
+    range->most_q8 = fixed_max(value_q8, range->most_q8);
     return range->most_q8 - range->least_q8;
 }
 

@@ -109,7 +109,7 @@ static inline int32_t expected_column(const plan_t *p, int32_t torque, int32_t c
                     phase_cell_distance_q4(&cell->flux, p->flux_max));
     const int32_t limit_column = current_limit_q9 >> MACHINE_COLUMN_BITS;
     const int32_t column = fixed_add(p->column, fixed_add(distance_q4, COLUMN_Q4 / 2) >> 4);
-    return fixed_clamp(column, 0, limit_column < PHASE_CELL_COLUMN_MAX ? limit_column : PHASE_CELL_COLUMN_MAX);
+    return fixed_clamp(column, 0, fixed_min(limit_column, PHASE_CELL_COLUMN_MAX));
 }
 
 /* Plans a phase again, in another cell if that is where the point is expected. */
@@ -172,10 +172,6 @@ static bool beyond(int32_t value, int32_t tolerance) {
     return (uint32_t)value + (uint32_t)tolerance > 2 * (uint32_t)tolerance;
 }
 
-static int32_t non_negative(int32_t flux_q29) {
-    return flux_q29 > 0 ? flux_q29 : 0;
-}
-
 /* torque * share, torque >= 0, share 0..1 in Q1.15: rounded to 4 LSB, exact for a share of 1. */
 static int32_t share_of(int32_t torque_q24, int32_t share_q15) {
     return share_q15 == ONE_Q15 ? torque_q24 : 4 * fixed_multiply_high(torque_q24, share_q15 << 15);
@@ -204,8 +200,8 @@ static inline void predict_flux(predictive_torque_t *control, const predictive_t
         flux_observer_step(sample->flux_observer, flux_q29, (int32_t)((uint32_t)sample->flux[phase] << flux_shift),
                            applied_q29, sample->current_q9[phase]);
     p->freewheeling_q29 = fixed_subtract(*flux_q29, resistive_drop_q29);
-    p->flux_min = non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
-    p->flux_max = non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
+    p->flux_min = fixed_non_negative(fixed_subtract(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
+    p->flux_max = fixed_non_negative(fixed_add(p->freewheeling_q29, flux_step_max_q29)) >> flux_shift;
 }
 
 /* Flux linkage that is built up at full voltage for the half that follows, up to the current limit. built: what Vdc has
@@ -298,7 +294,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const unsigned flux_shift = tables->flux_format.result_shift;
     const int32_t torque_q24 = sample->torque_q24;
     const int32_t opposed_q24 = fixed_clamp(parameters->reserve_q24 - fixed_abs(torque_q24), 0, INT32_MAX);
-    const int32_t positive_half_q24 = fixed_add(torque_q24 > 0 ? torque_q24 : 0, opposed_q24);
+    const int32_t positive_half_q24 = fixed_add(fixed_max(torque_q24, 0), opposed_q24);
     const int32_t negative_half_q24 = fixed_add(torque_q24 < 0 ? fixed_abs(torque_q24) : 0, opposed_q24);
 
     const int32_t torque[2] = {negative_half_q24 >> torque_shift, positive_half_q24 >> torque_shift};

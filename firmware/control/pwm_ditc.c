@@ -104,7 +104,7 @@ pwm_ditc_plan_t pwm_ditc_plan(const pwm_ditc_parameters_t *parameters, const mac
     const int32_t factor = factor_at(parameters, tables, sample->angle, sample->current_q9);
     const int32_t carrying_q9 = pwm_ditc_setpoint_q9(&parameters->current_setpoints, sample->reference_q24);
     const int32_t limit_q9 = parameters->current_limit_q9;
-    const int32_t setpoint_q9 = carrying_q9 < limit_q9 ? carrying_q9 : limit_q9;
+    const int32_t setpoint_q9 = fixed_min(carrying_q9, limit_q9);
     /* The rise takes as many periods as the deadbeat gain, twice incoming_gain, gives duties. */
     const int32_t periods_q15 =
         2 * ONE_Q15 + fixed_multiply_high(setpoint_q9 * (1 << 14), parameters->incoming_gain_q24);
@@ -211,5 +211,5 @@ void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, co
     const int32_t highest_q15 = ceiling_q15(parameters, sample->current_q9[regulated], duty_q15[regulated]);
     open_switches(duty_q15);
     duty_q15[other] = fixed_clamp(other_q15, -ONE_Q15, ONE_Q15);
-    duty_q15[regulated] = fixed_clamp(regulated_q15 < highest_q15 ? regulated_q15 : highest_q15, -ONE_Q15, ONE_Q15);
+    duty_q15[regulated] = fixed_clamp(fixed_min(regulated_q15, highest_q15), -ONE_Q15, ONE_Q15);
 }

@@ -61,7 +61,7 @@ static void set_narrow(const slow_counts_parameters_t *parameters, uint32_t peri
 /* The factor of l2 for a slope of the torque, by u = slope t^2 / J, Q12. */
 static int32_t slope_factor_q12(const slow_counts_parameters_t *parameters, uint32_t periods, int32_t slope_q24) {
     const uint32_t ratio_q8 = (periods << 8) / parameters->deadbeat_periods;
-    const int32_t z_q8 = (int32_t)(ratio_q8 < Z_MAX_Q8 ? ratio_q8 : Z_MAX_Q8);
+    const int32_t z_q8 = (int32_t)fixed_min_u32(ratio_q8, Z_MAX_Q8);
     const int32_t of_4_ms_q24 = fixed_product_shift_saturate(slope_q24, parameters->slope_gain_q16, 16);
     const int32_t u_q8 = fixed_clamp(fixed_multiply_high(of_4_ms_q24, z_q8 * z_q8), U_MIN_Q8, U_MAX_Q8);
     return ((ONE_Q16 + 48 * u_q8) << 12) / (ONE_Q16 + (15 * u_q8 >> 1));
@@ -85,7 +85,7 @@ static void set_deadbeat(const slow_counts_parameters_t *parameters, uint32_t pe
 NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t *counts,
                                uint32_t encoder_angle, uint32_t rotation, uint32_t periods) {
     const uint32_t passed = counts->periods + periods;
-    counts->periods = passed < PERIODS_MAX ? passed : PERIODS_MAX;
+    counts->periods = fixed_min_u32(passed, PERIODS_MAX);
     if ((uint64_t)counts->periods * rotation < parameters->count) {
         counts->interval = counts->periods;
     }
@@ -95,7 +95,7 @@ NOINLINE bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_
     }
     if (encoder_angle != counts->encoder_angle) {
         counts->encoder_angle = encoder_angle;
-        counts->apart = passed < PERIODS_MAX ? passed : PERIODS_MAX;
+        counts->apart = fixed_min_u32(passed, PERIODS_MAX);
         counts->periods = counts->interval = 0;
         counts->slow = long_since || (counts->slow && passed >= parameters->fast_periods);
     } else if (long_since) {
@@ -119,9 +119,9 @@ NOINLINE void slow_counts_update(const slow_counts_parameters_t *parameters, slo
 }
 
 uint32_t slow_counts_uncertain_angle(const slow_counts_parameters_t *parameters, const slow_counts_t *counts) {
-    const uint32_t apart = counts->apart > counts->interval ? counts->apart : counts->interval;
+    const uint32_t apart = fixed_max_u32(counts->apart, counts->interval);
     const uint32_t ratio_q8 = (apart << 8) / parameters->deadbeat_periods;
-    return (parameters->count >> 10) * (ratio_q8 < UNCERTAIN_MAX_Q8 ? ratio_q8 : UNCERTAIN_MAX_Q8);
+    return (parameters->count >> 10) * fixed_min_u32(ratio_q8, UNCERTAIN_MAX_Q8);
 }
 
 NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const load_observer_t *observer,

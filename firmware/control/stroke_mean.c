@@ -34,7 +34,7 @@ static bool differs(int32_t mean_q24, int32_t other_q24, uint32_t tolerance_q24)
 
 static void await_settling(const stroke_mean_parameters_t *parameters, stroke_mean_t *mean, uint32_t updates) {
     const uint32_t strokes = SETTLE_STROKES * updates;
-    mean->remaining = strokes > parameters->settle_updates ? strokes : parameters->settle_updates;
+    mean->remaining = fixed_max_u32(strokes, parameters->settle_updates);
 }
 
 /* The sums are those of Q7.24 numbers: in units of 2^8 they fit in 32 bits for 2^8 updates, of 2^16 for 2^16. */

@@ -139,8 +139,8 @@ static void integrate(table_scale_phase_t *phase, const table_scale_sample_t *sa
     phase->current_q9 = now_q9;
     phase->flux_q29 = flux_q29;
     phase->table_q29 = sample->table_q29;
-    phase->most_q9 = now_q9 > phase->most_q9 ? now_q9 : phase->most_q9;
-    phase->most_q29 = sample->table_q29 > phase->most_q29 ? sample->table_q29 : phase->most_q29;
+    phase->most_q9 = fixed_max(now_q9, phase->most_q9);
+    phase->most_q29 = fixed_max(sample->table_q29, phase->most_q29);
 }
 
 /* Reading of the sensor without a current: the least of the last readings, of which noise makes none larger. */

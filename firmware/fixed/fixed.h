@@ -32,6 +32,22 @@ static inline int32_t fixed_saturate(int64_t value) {
     return INT32_MAX ^ (high_word >> 31);
 }
 
+static inline int32_t fixed_min(int32_t a, int32_t b) {
+    return a < b ? a : b;
+}
+
+static inline int32_t fixed_max(int32_t a, int32_t b) {
+    return a > b ? a : b;
+}
+
+static inline uint32_t fixed_min_u32(uint32_t a, uint32_t b) {
+    return a < b ? a : b;
+}
+
+static inline uint32_t fixed_max_u32(uint32_t a, uint32_t b) {
+    return a > b ? a : b;
+}
+
 static inline int32_t fixed_clamp(int32_t value, int32_t low, int32_t high) {
     if (value > high) {
         return high;

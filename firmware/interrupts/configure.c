@@ -82,7 +82,7 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
  * DBC, which has a resolution of its own, is within. */
 static int32_t speed_reference_max_q22(const torque_mode_parameters_t *torque_mode, const machine_tables_t *tables) {
     const int32_t fold_back_q22 = torque_mode->speed_end_q22 - torque_mode->fold_back_range_q22 + 2;
-    return fold_back_q22 < tables->speed_max_q22 ? fold_back_q22 : tables->speed_max_q22;
+    return fixed_min(fold_back_q22, tables->speed_max_q22);
 }
 
 /* Duty per scaled error from duty per N m at GAIN_RATE_HZ, both Q15. */
@@ -183,13 +183,13 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     const int32_t one_period_q9 = highest_before_trip_q9(values, tables, control_rate_hz, 11);
     const int32_t period_q9 = one_period_q9 > two_periods_q9 ? one_period_q9 - two_periods_q9 : 1;
     const int32_t ceiling_q9 = one_period_q9 + period_q9;
-    control->hysteresis.current_limit_q9 = two_periods_q9 < limit_q9 ? two_periods_q9 : limit_q9;
+    control->hysteresis.current_limit_q9 = fixed_min(two_periods_q9, limit_q9);
     control->hysteresis.generating_limit_q9 = two_periods_q9;
     control->hysteresis.generating_slope_q19 =
         fixed_saturate(fixed_divide((int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32,
                                     speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
     control->duty.current_limit_q9 = limit_q9;
-    control->duty.current_ceiling_q9 = ceiling_q9 > limit_q9 ? ceiling_q9 : limit_q9;
+    control->duty.current_ceiling_q9 = fixed_max(ceiling_q9, limit_q9);
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
 }
 
@@ -261,7 +261,7 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, const mac
     const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_EARLY_DEG]);
     /* Windows overlap by at least 2 degrees, advanced or not; smaller settings are widened. */
     const uint32_t least = stroke + angle_from_degrees(2 << 7);
-    const uint32_t width = turn_off - turn_on > least ? turn_off - turn_on : least;
+    const uint32_t width = fixed_max_u32(turn_off - turn_on, least);
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
     return (torque_sharing_parameters_t){
         .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
@@ -275,7 +275,7 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, const mac
 
 /* The fields of the phases hardly raise a large DC link: a 32nd of the over-voltage threshold is the least range. */
 static int32_t fold_back_range_q6(int32_t over_voltage_q6, int32_t range_q6) {
-    return range_q6 > over_voltage_q6 / 32 ? range_q6 : over_voltage_q6 / 32;
+    return fixed_max(range_q6, over_voltage_q6 / 32);
 }
 
 static conduction_parameters_t conduction_from(const int32_t *values, const machine_tables_t *tables,
@@ -287,7 +287,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
     const int32_t range_q6 = fold_back_range_q6(over_voltage_q6, tables->fold_back_q6);
     const int32_t mean_range_q6 = fold_back_range_q6(over_voltage_q6, tables->mean_fold_back_q6);
     /* A chopper is to have something left to take. */
-    const int32_t end_q6 = range_q6 / 2 < mean_range_q6 * 3 / 4 ? range_q6 / 2 : mean_range_q6 * 3 / 4;
+    const int32_t end_q6 = fixed_min(range_q6 / 2, mean_range_q6 * 3 / 4);
     /* Twice the largest braking torque: a larger one would hardly leave a range. */
     const int32_t link_torque_q24 =
         fixed_clamp(values[PARAMETER_TORQUE_MAX_NM], 0,
@@ -368,7 +368,7 @@ static void set_edge_timing(control_parameters_t *control, unsigned speed_expone
     const uint32_t two_periods = timer_clock_hz / 10000u; /* at 20 kHz */
     control->edge_angle_per_tick_q51 = (int32_t)fixed_divide(ANGLE_PER_RAD_Q29 + shifted_hz / 2u, shifted_hz);
     control->edge_age_shift = (uint8_t)age_shift;
-    control->edge_age_max_ticks = (uint16_t)(two_periods < age_max ? two_periods : age_max);
+    control->edge_age_max_ticks = (uint16_t)fixed_min_u32(two_periods, age_max);
 }
 
 /* The window in which each law uses a phase. */

@@ -401,7 +401,7 @@ static void set_speed_law(const control_parameters_t *parameters, deferred_t *de
     const int32_t excess_q31 = deferred->conduction.gain_excess_q31;
     deferred->speed_smc.gain_q24 = gain_q24 - 2 * fixed_multiply_high(gain_q24, excess_q31);
     const int32_t epsilon_q31 = full_q31 - 2 * fixed_multiply_high(full_q31, excess_q31);
-    deferred->speed_smc.epsilon_q31 = epsilon_q31 > SPEED_SMC_EPSILON_MIN_Q31 ? epsilon_q31 : SPEED_SMC_EPSILON_MIN_Q31;
+    deferred->speed_smc.epsilon_q31 = fixed_max(epsilon_q31, SPEED_SMC_EPSILON_MIN_Q31);
 }
 
 COLD void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {

@@ -74,14 +74,14 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
                             const command_t *command, int32_t limit_q24, deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
     int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
-    min_q24 = min_q24 > -limit_q24 ? min_q24 : -limit_q24;
-    max_q24 = max_q24 < limit_q24 ? max_q24 : limit_q24;
+    min_q24 = fixed_max(min_q24, -limit_q24);
+    max_q24 = fixed_min(max_q24, limit_q24);
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE && !conduction_at_rest(input->speed_q22)) {
         const int32_t braking_q24 = conduction_braking_q24(&parameters->conduction, input->dc_link_voltage_q6);
         if (input->speed_q22 < 0) {
-            max_q24 = max_q24 < braking_q24 ? max_q24 : braking_q24;
+            max_q24 = fixed_min(max_q24, braking_q24);
         } else {
-            min_q24 = min_q24 > -braking_q24 ? min_q24 : -braking_q24;
+            min_q24 = fixed_max(min_q24, -braking_q24);
         }
     }
     int32_t torque_q24 = 0;

@@ -38,8 +38,8 @@ COLD void degraded_step(const degraded_parameters_t *parameters, degraded_t *deg
     const uint32_t electrical = degraded->angle * (UINT32_MAX / DEGRADED_ANGLES + 1u);
     const int32_t torque_q24 = degraded_torque_q24(parameters, degraded, tables, electrical);
     degraded->sum_q24 += torque_q24;
-    degraded->least_q24 = torque_q24 < degraded->least_q24 ? torque_q24 : degraded->least_q24;
-    degraded->most_q24 = torque_q24 > degraded->most_q24 ? torque_q24 : degraded->most_q24;
+    degraded->least_q24 = fixed_min(torque_q24, degraded->least_q24);
+    degraded->most_q24 = fixed_max(torque_q24, degraded->most_q24);
     degraded->angle++;
     if (degraded->angle == DEGRADED_ANGLES) {
         degraded->mean_q24 = (int32_t)(degraded->sum_q24 / (int32_t)DEGRADED_ANGLES);

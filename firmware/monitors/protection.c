@@ -56,7 +56,7 @@ NOINLINE static void count(protection_deferred_t *protection, uint32_t encoder_a
     const int32_t before_q22 = protection->speed_counted_q22;
     protection->encoder_angle = encoder_angle;
     protection->frozen = false;
-    protection->speed_lower_bound_q22 = speed_q22 < before_q22 ? speed_q22 : before_q22;
+    protection->speed_lower_bound_q22 = fixed_min(speed_q22, before_q22);
     protection->speed_counted_q22 = speed_q22;
     protection->undetected_travel = 0;
 }
@@ -72,7 +72,7 @@ static bool encoder_frozen(const protection_parameters_t *parameters, protection
         count(protection, input->encoder_angle, fixed_abs(input->speed_q22));
         return false;
     }
-    const int32_t periods = (int32_t)(input->periods < PERIODS_MAX ? input->periods : PERIODS_MAX);
+    const int32_t periods = (int32_t)fixed_min_u32(input->periods, PERIODS_MAX);
     const int32_t bound_q22 =
         fixed_subtract(protection->speed_lower_bound_q22, parameters->deceleration_max_q22 * periods);
     protection->speed_lower_bound_q22 = bound_q22;

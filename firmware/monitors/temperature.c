@@ -35,10 +35,10 @@ static int32_t read_part(temperature_t *temperature, const hal_t *hal, unsigned 
         uint8_t *invalid = &temperature->invalid[sensor];
         if (reading >= HAL_ADC_TEMPERATURE_CODE_MIN && reading <= HAL_ADC_TEMPERATURE_CODE_MAX) {
             *invalid = 0;
-            hottest = reading > hottest ? reading : hottest;
+            hottest = fixed_max(reading, hottest);
             continue;
         }
-        hottest = before > hottest ? before : hottest;
+        hottest = fixed_max(before, hottest);
         if (*invalid < TEMPERATURE_INVALID_MAX) {
             ++*invalid;
         }
@@ -63,7 +63,7 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
         const int32_t room = parameters->limit[part] - hottest;
         temperature->hottest[part] = hottest;
         temperature->hot[part] = temperature->hot[part] ? room < DERATE_CODES : room <= 0;
-        least_room = room < least_room ? room : least_room;
+        least_room = fixed_min(room, least_room);
     }
     const int64_t part_of_max = (int64_t)parameters->torque_max_q24 * fixed_non_negative(least_room);
     temperature->torque_limit_q24 = (int32_t)fixed_divide(part_of_max, DERATE_CODES);

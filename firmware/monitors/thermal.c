@@ -63,7 +63,7 @@ COLD bool thermal_sample(const thermal_parameters_t *parameters, thermal_t *ther
     if (step_us < THERMAL_STEP_US) {
         return false;
     }
-    step_us = step_us < THERMAL_STEP_MAX_US ? step_us : THERMAL_STEP_MAX_US;
+    step_us = fixed_min_u32(step_us, THERMAL_STEP_MAX_US);
     const uint64_t reciprocal_q32 =
         UINT32_MAX / thermal->samples; /* the product is below 2^64: no square is above 2^32 */
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
@@ -81,7 +81,7 @@ COLD bool thermal_sample(const thermal_parameters_t *parameters, thermal_t *ther
 
 COLD int32_t thermal_torque_limit_q24(const thermal_parameters_t *parameters, const thermal_t *thermal) {
     const uint32_t winding_q16 = thermal_winding_load_q16(thermal), switch_q16 = thermal_switch_load_q16(thermal);
-    const int32_t load_q16 = (int32_t)(winding_q16 > switch_q16 ? winding_q16 : switch_q16);
+    const int32_t load_q16 = (int32_t)fixed_max_u32(winding_q16, switch_q16);
     const int32_t range_q16 = THERMAL_LIMIT_Q16 - THERMAL_DERATE_Q16;
     const int32_t room_q16 = fixed_clamp(THERMAL_LIMIT_Q16 - load_q16, 0, range_q16);
     return (int32_t)fixed_divide((int64_t)parameters->torque_max_q24 * room_q16, range_q16);
