@@ -282,7 +282,8 @@ SPECIFIED = {"current_sensor_gain": 1.05, "current_sensor_offset_A": 0.5, "curre
 
 @pytest.mark.parametrize("errors", [{}, SPECIFIED], ids=["ideal", "specified_errors"])
 @pytest.mark.parametrize(("machine", "controller", "bits", "edges", "speed_rpm", "load_Nm"), HEALTHY)
-def test_healthy_encoder_is_no_fault(make_bench, machine, controller, bits, edges, speed_rpm, load_Nm, errors):
+def test_healthy_encoder_is_no_fault(  # noqa: PLR0913, PLR0917 - a case has as many parameters
+        make_bench, machine, controller, bits, edges, speed_rpm, load_Nm, errors):
     bench = make_bench(machine=machine, controller=controller, encoder_bits=bits, encoder_edges=edges,
                        initial_angle_deg=33.0)
     for name, value in errors.items():

@@ -141,7 +141,8 @@ class Schedule:
                 self.volts[row, index] = volts
 
 
-def run_batch(machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
+def run_batch(  # noqa: PLR0915 - one loop, whose arrays all of its parts share
+        machines: Sequence[Machine], runs: Sequence[Run]) -> list[Trace]:
     """States at the start of each period and at the end, for runs of equal length; machines sorted by form."""
     rows = len(runs)
     all_rows = np.arange(rows)

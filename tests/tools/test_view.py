@@ -202,7 +202,7 @@ def torque_of_the_loops(visitor):
     return sum(map(float, work_J)) * 4 / (2 * math.pi) / torque_Nm  # four rotor poles
 
 
-def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):
+def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: PLR0915 - one visit, step by step
     visitor, bench, page = live(), live.bench, None
     page = visitor.page
     page.keyboard.press("Tab")

@@ -47,7 +47,7 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(2)
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of commands and options, without a branch
     """All commands and their options."""
     parser = _Parser(prog=COMMAND, description="Salient: a switched-reluctance drive and its test bench.")
     parser.add_argument("--version", action="version", version=f"salient {VERSION}")

@@ -102,12 +102,13 @@ def _one(passed: bool) -> Count:
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 def _style() -> Count:
-    """ruff, mypy, clang-format, clang-tidy and British spelling."""
+    """ruff, mypy, clang-format, clang-tidy, limits of C functions and British spelling."""
     count = _one(_succeeds(_tool("ruff"), "check", "--no-cache", "--config", CONFIGURATION, "tools", "tests"))
     count += _one(_succeeds(_tool("mypy"), "--config-file", CONFIGURATION, "--no-error-summary"))
     sources = _sources(*SOURCE_FOLDERS, suffixes=(".c", ".h", ".cpp"))
     count += _one(_succeeds(_tool("clang-format"), "--dry-run", "-Werror", *sources))
     count += _one(_clang_tidy())
+    count += _one(_within_limits())
     documents = sorted(ROOT.glob("*.md"))
     count += _one(_succeeds(_tool("codespell"), "--toml", CONFIGURATION, *documents,
                             *(name for name in CHECKED_FOR_SPELLING if (ROOT / name).exists())))
@@ -202,6 +203,16 @@ def _clang_tidy() -> bool:
     with ThreadPoolExecutor(CORES) as pool:
         passed = list(pool.map(lambda part: _succeeds(*command, *part), (sources[at::CORES] for at in range(CORES))))
     return bool(sources) and all(passed)
+
+
+def _within_limits() -> bool:
+    """Sizes of C functions and files."""
+    from salient import c_limits
+
+    lines = c_limits.violations(c_limits.read_exceptions())
+    for line in lines:
+        _print(line)
+    return not lines
 
 
 def _ctest(preset: str) -> Count:

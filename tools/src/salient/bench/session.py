@@ -94,7 +94,7 @@ class Session(KnownAttributes):
     drive: Drive
     rig: Rig
 
-    def __init__(self, address: str, lockstep: bool = True,
+    def __init__(self, address: str, lockstep: bool = True,  # noqa: PLR0913, PLR0917 - each has a default
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
                  is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
                  node: int = 0, drives: int = 1, silence_max_s: float = math.inf) -> None:

@@ -98,8 +98,9 @@ def _inverse_table(magnetics: Any, current_A: float) -> tuple[np.ndarray, np.nda
     return table, limit_Wb
 
 
-def speed_change_s(magnetics: Any, phases: int, source: Source, current_A: float, torque_max_Nm: float,
-                   inertia_kg_m2: float, friction_Nm_s: float, from_rad_s: float, to_rad_s: float) -> float:
+def speed_change_s(magnetics: Any, phases: int,  # noqa: PLR0913, PLR0917 - the quantities of one machine
+                   source: Source, current_A: float, torque_max_Nm: float, inertia_kg_m2: float,
+                   friction_Nm_s: float, from_rad_s: float, to_rad_s: float) -> float:
     """Time that a machine takes from one speed to another: full voltage on every phase whose torque helps and full
     opposite voltage on the others, currents up to current_A, the sum of the torques up to torque_max_Nm; the phases
     carry no current at first, and phase 0 is aligned. A drive that turns phases on earlier may need a little less."""

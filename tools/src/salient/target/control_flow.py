@@ -189,7 +189,7 @@ _RISCV_BRANCH = re.compile(r"b(eq|ne|lt|ge|gt|le)(u|z)?")
 _RISCV_ANNOTATED = re.compile(r"#\s*([0-9a-f]+) <")
 
 
-def _riscv(code: ControlFlow, one: Instruction) -> Flow:
+def _riscv(code: ControlFlow, one: Instruction) -> Flow:  # noqa: PLR0911 - a return for each kind of instruction
     """RV32IMAC, with the disassembler's pseudo-instructions."""
     mnemonic = one.mnemonic
     if _RISCV_BRANCH.fullmatch(mnemonic):

@@ -343,7 +343,8 @@ def step_scenario(**fields: Any) -> Scenario:
                      load=(LoadStep(STEP_AT_S, LOAD_NM),), record=Record(1.0, STEP_AT_S), **fields)
 
 
-def _steady(group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
+def _steady(  # noqa: PLR0913, PLR0917 - each is a condition of the case
+          group: str, condition: str, speed_rpm: float, from_s: float, quick: bool, traced: bool = False,
           loaded_s: float = STEP_AT_S, load_Nm: float = LOAD_NM, pulses: int | None = None,
           **fields: Any) -> Iterator[Case]:
     """Constant speed against a load, recorded from from_s. pulses: None for the default parameters."""

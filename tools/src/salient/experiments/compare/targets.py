@@ -158,6 +158,26 @@ def _paper_conditions() -> dict[Key, Target]:
     return targets
 
 
+def _encoders(machine: str, angles: int) -> dict[Key, Target]:
+    targets = {}
+    for bits in range_cases.ENCODER_BITS:
+        for stamps in ("", " and edge stamps"):
+            for speed_rpm in range_cases.ENCODER_SPEEDS_RPM:
+                if not range_cases.encoder_allows(machine, bits, speed_rpm):
+                    continue
+                condition = f"{machine}, {bits} bits{stamps}, {speed_rpm:g} r/min"
+                for row, limit in ((("failed", "count"), 0.0), (("against_periods", "worst"), 2.0)):
+                    targets["encoders", condition, *row] = Target(limit, samples=angles, sample_unit="angles")
+    for bits in range_cases.COURSE_BITS:
+        for speed_rpm in range_cases.COURSE_SPEEDS_RPM:
+            if range_cases.encoder_allows(machine, bits, speed_rpm):
+                condition = f"{machine}, {bits} bits, {speed_rpm:g} r/min, mean"
+                for row, limit in ((("failed", "count"), 0.0), (("against_periods", "worst"), 2.0),
+                                   (("mean_error_percent", "worst"), 0.1), (("course_counts", "worst"), 2.0)):
+                    targets["encoders", condition, *row] = Target(limit)
+    return targets
+
+
 def _ranges() -> dict[Key, Target]:
     targets = {}
     for machine in MACHINES:
@@ -172,21 +192,7 @@ def _ranges() -> dict[Key, Target]:
         for load_Nm in range_cases.HOLD_LOADS_NM:
             targets["hold", f"{machine}, {load_Nm:g} N m", "drift_deg", ""] = Target(0.1)
     for machine, angles in range_cases.ENCODER_ANGLES.items():
-        for bits in range_cases.ENCODER_BITS:
-            for stamps in ("", " and edge stamps"):
-                for speed_rpm in range_cases.ENCODER_SPEEDS_RPM:
-                    if not range_cases.encoder_allows(machine, bits, speed_rpm):
-                        continue
-                    condition = f"{machine}, {bits} bits{stamps}, {speed_rpm:g} r/min"
-                    for row, limit in ((("failed", "count"), 0.0), (("against_periods", "worst"), 2.0)):
-                        targets["encoders", condition, *row] = Target(limit, samples=angles, sample_unit="angles")
-        for bits in range_cases.COURSE_BITS:
-            for speed_rpm in range_cases.COURSE_SPEEDS_RPM:
-                if range_cases.encoder_allows(machine, bits, speed_rpm):
-                    condition = f"{machine}, {bits} bits, {speed_rpm:g} r/min, mean"
-                    for row, limit in ((("failed", "count"), 0.0), (("against_periods", "worst"), 2.0),
-                                       (("mean_error_percent", "worst"), 0.1), (("course_counts", "worst"), 2.0)):
-                        targets["encoders", condition, *row] = Target(limit)
+        targets |= _encoders(machine, angles)
         offsets = [f"{speed_rpm:g} r/min, {offset_deg:g} deg" for speed_rpm in range_cases.OFFSET_SPEEDS_RPM
                    for offset_deg in range_cases.OFFSETS_DEG]
         for offset in (*offsets, "150 r/min, 0 deg, moving load", "150 r/min, 0.5 deg, moving load"):
