@@ -8,6 +8,7 @@
 #include "plant/hermite.h"
 #include "plant/integrator.h"
 #include "plant/magnetics_kernel.h"
+#include "plant/min_max.h"
 #include "plant/units.h"
 
 /* After an event, a DC-link voltage within this tolerance of its threshold is set to it. */
@@ -181,7 +182,7 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
         for (unsigned index = 0; index < setting->count; index++) {
             const double at_A = hermite(x, step_s, start->current_A[index], first->current_A_s[index],
                                         end->current_A[index], last.current_A_s[index]);
-            plant->current_A[setting->phase[index]] = at_A > 0.0 ? at_A : 0.0;
+            plant->current_A[setting->phase[index]] = max_double(at_A, 0.0);
         }
         plant_take_sample(plant);
         at_s = (double)(plant->observation.next_ns - time_ns) * S_PER_NS;
@@ -304,7 +305,7 @@ static void integrate(plant_t *plant, common_step_t *step, double remaining_s) {
     integrator_differentiate(setting, &step->start, &step->first);
     double length_s = step_length_s(plant, setting, &step->first, remaining_s);
     step->passes = step->chatter >= CHATTER_EVENTS;
-    length_s = step->passes && length_s > PASS_S ? PASS_S : length_s;
+    length_s = step->passes ? min_double(length_s, PASS_S) : length_s;
     integrator_step(setting, &step->start, &step->first, length_s, &step->end, &step->integrals);
     step->event = !step->passes && distance_to_event(setting, &step->end) < 0.0;
     if (step->event) {

@@ -5,6 +5,7 @@
 
 #include "plant/event_bracket.h"
 #include "plant/hermite.h"
+#include "plant/min_max.h"
 
 /* Longest step, in time constants of the link. */
 #define STEP_TIME_CONSTANTS 0.1
@@ -57,9 +58,9 @@ static void decide(link_t *link) {
         link->falling_V = link->supply_V;
     }
     if (link->chopper_on) {
-        link->falling_V = link->falling_V > machine->chopper_off_V ? link->falling_V : machine->chopper_off_V;
+        link->falling_V = max_double(link->falling_V, machine->chopper_off_V);
     } else if (chopper) {
-        link->rising_V = link->rising_V < machine->chopper_on_V ? link->rising_V : machine->chopper_on_V;
+        link->rising_V = min_double(link->rising_V, machine->chopper_on_V);
     }
     link->longest_s = link->plant->limits.factor * STEP_TIME_CONSTANTS / (link->conductance_S * -link->charge_1_F);
     link->step_max_s = link->record == NULL ? link->longest_s : 0.0;
@@ -116,7 +117,7 @@ bool link_advance_in_steps(link_t *link, double to_s) {
         }
         const double rest_s = to_s - link->at_s, from_s = link->at_s;
         const double start_V = link->voltage_V, start_V_s = link_slope_V_s(link);
-        double step_s = rest_s <= link->longest_s ? rest_s : link->longest_s;
+        double step_s = min_double(rest_s, link->longest_s);
         link_result_t result = link_step(link, step_s);
         const bool event = result.end_V > link->rising_V || result.end_V < link->falling_V;
         if (event) {

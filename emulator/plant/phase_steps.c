@@ -7,6 +7,7 @@
 
 #include "plant/link_steps.h"
 #include "plant/magnetics_kernel.h"
+#include "plant/min_max.h"
 #include "plant/phase_samples.h"
 #include "plant/phase_walk.h"
 #include "plant/rotor_step.h"
@@ -88,7 +89,7 @@ MAGNETICS_INLINE bool walk_together(plant_t *plant, magnetics_form_t form, const
             if (!walk_on(plant, form, phase_of[n], rotor, link, at_s, &walks[n], sums, records)) {
                 return false;
             }
-            next_s = lesser(walks[n].end_s, next_s);
+            next_s = min_double(walks[n].end_s, next_s);
         }
         if (at_s >= rotor->length_s) {
             return true;

@@ -11,6 +11,7 @@
 #include "plant/hermite.h"
 #include "plant/link_steps.h"
 #include "plant/magnetics_kernel.h"
+#include "plant/min_max.h"
 #include "plant/phase_samples.h"
 #include "plant/plant_state.h"
 #include "plant/rotor_step.h"
@@ -31,10 +32,6 @@ typedef struct {
     unsigned walked;                                              /* phases that had current or edges: bits */
     uint8_t switches[HAL_PHASES_MAX], edge_next[HAL_PHASES_MAX];  /* theirs at the end */
 } sums_t;
-
-static inline double lesser(double a, double b) {
-    return a < b ? a : b;
-}
 
 /* Shortens a step so that it ends where the phase's magnetics are not smooth; true if it does. */
 static bool end_at_corner(const plant_t *plant, unsigned phase, const rotor_step_t *rotor, plant_phase_t *state,
@@ -140,7 +137,7 @@ MAGNETICS_INLINE void follow_edges(const rotor_step_t *rotor, walk_t *walk) {
     for (; walk->edge < pattern->count; walk->edge++) {
         const double edge_s = (double)(int32_t)(pattern->delay_ns[walk->edge] - rotor->start_ns) * S_PER_NS;
         if (edge_s > at_s) {
-            until_s = lesser(until_s, edge_s);
+            until_s = min_double(until_s, edge_s);
             break;
         }
         walk->switches = pattern->switches[walk->edge];
@@ -311,7 +308,7 @@ MAGNETICS_INLINE void end_current(const plant_t *plant, magnetics_form_t form, u
     const double ohm = plant->resistance_ohm[phase][on], flux_Wb = walk->flux_Wb, step_s = walk->step_s;
     const bool tied = is_tied(link, on);
     const double voltage_V = tied ? (end->driven_Wb - flux_Wb) / step_s : walk->voltage_V;
-    const double near_s = voltage_V < 0.0 ? lesser(-flux_Wb / voltage_V, step_s) : step_s;
+    const double near_s = voltage_V < 0.0 ? min_double(-flux_Wb / voltage_V, step_s) : step_s;
     course_t *current = &end->current;
     magnetics_kernel(&plant->magnetics, form, start_rad - walk->offset_rad + near_s * start_rad_s, 0.0, 0.0,
                      &walk->point);

@@ -5,6 +5,7 @@
 
 #include "plant/common_steps.h"
 #include "plant/faulted.h"
+#include "plant/min_max.h"
 #include "plant/phase_steps.h"
 
 /* Limits of a step at factor 1, chosen for errors of currents, torque and speed below 1e-6 of their range (measured
@@ -182,7 +183,7 @@ void plant_advance(plant_t *plant, uint64_t to_ns) {
             continue;
         }
         const uint64_t edge_ns = plant_follow_edges(plant, to_ns);
-        common_steps_advance(plant, plant->trip_ns < edge_ns ? plant->trip_ns : edge_ns);
+        common_steps_advance(plant, min_u64(plant->trip_ns, edge_ns));
         plant_follow_edges(plant, to_ns);
     }
     if (plant->observation.sample != NULL && plant->observation.next_ns == plant->time_ns) {

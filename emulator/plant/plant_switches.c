@@ -1,5 +1,7 @@
 #include "plant/plant_switches.h"
 
+#include "plant/min_max.h"
+
 void plant_set_switches(plant_t *plant, const hal_pwm_compare_t *compare, uint16_t period_ticks) {
     const bool other = period_ticks != plant->pattern_source.period_ticks ||
                        !(plant->minimum_pulse_ns == plant->pattern_source.minimum_pulse_ns);
@@ -29,7 +31,7 @@ uint64_t plant_follow_edges(plant_t *plant, uint64_t to_ns) {
         for (; plant->edge_next[phase] < pattern->count; plant->edge_next[phase]++) {
             const uint64_t edge_ns = plant->pattern_ns + pattern->delay_ns[plant->edge_next[phase]];
             if (edge_ns > plant->time_ns) {
-                next_ns = edge_ns < next_ns ? edge_ns : next_ns;
+                next_ns = min_u64(edge_ns, next_ns);
                 break;
             }
             plant->switches[phase] = pattern->switches[plant->edge_next[phase]];

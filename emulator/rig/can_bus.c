@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "plant/min_max.h"
 #include "rig/can_wire.h"
 
 #define NS_PER_S UINT64_C(1000000000)
@@ -16,14 +17,6 @@ static uint64_t bits_later(const can_bus_t *bus, uint64_t start_ns, uint64_t bit
 
 static uint64_t bits_between(const can_bus_t *bus, uint64_t from_ns, uint64_t to_ns) {
     return ((to_ns - from_ns) * bus->bit_rate + NS_PER_S / 2) / NS_PER_S;
-}
-
-static uint64_t earlier(uint64_t a, uint64_t b) {
-    return a < b ? a : b;
-}
-
-static uint64_t later(uint64_t a, uint64_t b) {
-    return a > b ? a : b;
 }
 
 void can_bus_init(can_bus_t *bus, uint32_t bit_rate, uint64_t seed) {
@@ -244,9 +237,9 @@ static can_mailbox_t *best_mailbox(can_bus_t *bus, can_node_t *node, uint64_t no
         if (!mailbox->drawn && mailbox->not_before_ns <= now_ns) {
             draw_fault(bus, node, mailbox, now_ns);
         }
-        const uint64_t not_before_ns = later(mailbox->not_before_ns, node->suspended_till_ns);
+        const uint64_t not_before_ns = max_u64(mailbox->not_before_ns, node->suspended_till_ns);
         if (not_before_ns > now_ns) {
-            *wake_ns = earlier(*wake_ns, not_before_ns);
+            *wake_ns = min_u64(*wake_ns, not_before_ns);
         } else if (!best || mailbox->arbitration < best->arbitration ||
                    (mailbox->arbitration == best->arbitration && mailbox->request < best->request)) {
             best = mailbox;
@@ -261,18 +254,18 @@ static void count_recessive(const can_bus_t *bus, const can_line_t *line, can_no
     if (!node->rejoins) {
         return;
     }
-    const uint64_t from_ns = later(line->recessive_from_ns, node->rejoins_from_ns);
+    const uint64_t from_ns = max_u64(line->recessive_from_ns, node->rejoins_from_ns);
     const uint64_t done_ns = bits_later(bus, from_ns, (uint64_t)node->sequences_left * RECESSIVE_SEQUENCE_BITS);
     if (done_ns <= now_ns) {
         can_node_count_recessive(node, node->sequences_left);
     } else {
-        *wake_ns = earlier(*wake_ns, done_ns);
+        *wake_ns = min_u64(*wake_ns, done_ns);
     }
 }
 
 /* A frame starts: what has been counted of the recessive bits before it is kept. */
 static void keep_recessive(const can_bus_t *bus, const can_line_t *line, can_node_t *node, uint64_t now_ns) {
-    const uint64_t from_ns = later(line->recessive_from_ns, node->rejoins_from_ns);
+    const uint64_t from_ns = max_u64(line->recessive_from_ns, node->rejoins_from_ns);
     if (node->rejoins && from_ns < now_ns) {
         can_node_count_recessive(node, bits_between(bus, from_ns, now_ns) / RECESSIVE_SEQUENCE_BITS);
     }
@@ -475,7 +468,7 @@ static bool step_line(can_bus_t *bus, can_line_t *line, can_bus_delivery_t *deli
         if (apply_changes(bus, &bus->drives[i])) {
             can_line_t *other = drive_line(bus, &bus->drives[i]);
             other->next_event_ns =
-                other->state == CAN_LINE_IDLE ? later(now_ns, other->idle_from_ns) : other->next_event_ns;
+                other->state == CAN_LINE_IDLE ? max_u64(now_ns, other->idle_from_ns) : other->next_event_ns;
         }
     }
     return complete;

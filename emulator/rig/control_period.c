@@ -1,11 +1,12 @@
 #include "rig/control_period.h"
 
+#include "plant/min_max.h"
 #include "plant/pwm_timer.h"
 
 void control_period_schedule_hold(control_period_t *period) {
     const uint64_t control_ns = period->scheduler->due_ns[EVENT_CONTROL];
     const uint64_t delay_ns = (uint64_t)(period->sensors->errors.current_delay_ns + 0.5);
-    const uint64_t before_ns = delay_ns < period->length_ns ? delay_ns : period->length_ns;
+    const uint64_t before_ns = min_u64(delay_ns, period->length_ns);
     const bool ahead = before_ns > 0 && control_ns - period->board->time_ns >= before_ns;
     period->scheduler->due_ns[EVENT_CURRENT_HOLD] = ahead ? control_ns - before_ns : SCHEDULER_NEVER;
     period->sensors->currents_held = false;
@@ -95,10 +96,6 @@ void control_period_hold(control_period_t *period, uint64_t now_ns) {
     sensors_hold_currents(period->sensors, period->plant);
 }
 
-static uint64_t at_least(uint64_t time_ns, uint64_t least_ns) {
-    return time_ns > least_ns ? time_ns : least_ns;
-}
-
 void control_period_start(control_period_t *period, uint64_t now_ns) {
     const bool lost = period->interrupts_lost && now_ns >= period->interrupt_end_ns;
     const bool busy = lost || now_ns < period->interrupt_end_ns;
@@ -115,10 +112,10 @@ void control_period_start(control_period_t *period, uint64_t now_ns) {
         return;
     }
     call_deferred(period);
-    period->board->interrupt_took_ns = at_least(period->interrupt_time_ns, period->interrupt_late_ns);
+    period->board->interrupt_took_ns = max_u64(period->interrupt_time_ns, period->interrupt_late_ns);
     call_control(period);
     /* A target has set the time that it took. */
-    period->board->interrupt_took_ns = at_least(period->board->interrupt_took_ns, period->interrupt_late_ns);
+    period->board->interrupt_took_ns = max_u64(period->board->interrupt_took_ns, period->interrupt_late_ns);
     if (period->board->interrupt_took_ns == 0) {
         call_deferred(period);
         call_background(period);

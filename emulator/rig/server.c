@@ -2,16 +2,13 @@
 
 #include <string.h>
 
+#include "plant/min_max.h"
 #include "rig/faults.h"
 #include "rig/load.h"
 #include "rig/stimulus.h"
 #include "rig_codec.h"
 
 #define LOAD_PROFILE_LSB 1e-6 /* of value in RIG_LOAD_PROFILE */
-
-static uint64_t earlier(uint64_t a, uint64_t b) {
-    return a < b ? a : b;
-}
 
 static bool stop_requested(rig_t *rig) {
     return rig->config.stop.requested && rig->config.stop.requested(rig->config.stop.context);
@@ -196,7 +193,7 @@ static bool serve_lockstep(rig_t *rig, int timeout_ms) {
     shared_bus_start(&rig->shared_bus);
     uint64_t target_ns = rig->server.runs[0].time_ns;
     while (rig->board.time_ns < target_ns && !abandon_runs(rig)) {
-        advance(rig, earlier(target_ns, rig->server.stop_checked_ns + RIG_STOP_STEP_NS));
+        advance(rig, min_u64(target_ns, rig->server.stop_checked_ns + RIG_STOP_STEP_NS));
         if (rig->config.transport->failure || check_stop_when_due(rig)) {
             return false;
         }
@@ -208,7 +205,7 @@ static bool serve_lockstep(rig_t *rig, int timeout_ms) {
 static bool serve_moving(rig_t *rig) {
     shared_bus_start(&rig->shared_bus);
     uint64_t reading_ns = (rig->board.time_ns / RIG_READ_STEP_NS + 1) * RIG_READ_STEP_NS;
-    advance(rig, earlier(reading_ns, rig->config.stop_at_ns));
+    advance(rig, min_u64(reading_ns, rig->config.stop_at_ns));
     transport_flush(rig->config.transport);
     if (rig->board.time_ns >= rig->config.stop_at_ns) {
         return false;
