@@ -7,6 +7,9 @@
  *
  * The second derivatives follow from those of the magnetics. A step evaluates the magnetics, which dominate its
  * execution time, twice instead of four times as the classical method does. Energies are integrated by the same method.
+ *
+ * All states step together: with faults and where a comparator responds (common_steps.h). phase_steps.h has the other
+ * way to step, and the reason for two.
  */
 #ifndef PLANT_INTEGRATOR_H
 #define PLANT_INTEGRATOR_H

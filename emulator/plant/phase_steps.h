@@ -17,6 +17,14 @@
  *
  * A current ends where its flux linkage does, which is a scalar equation.
  *
+ * There are two ways to step for the speed of the emulator. Stepped together by integrator.h, the healthy plant takes
+ * 1.7 times as many instructions with the traditional controller and 3.2 times with paper and salient, whose phases
+ * have edges at different times; plant, drive and bench together 1.2, 1.9 and 1.9 times (saturating machine, 40 kHz,
+ * 600 r/min, 8 N m). These steps carry no faults, because they hold only where the flux linkage of a phase follows from
+ * its voltage alone, at an inductance and a resistance that are its own: shorted turns tie the current of the terminals
+ * to the flux rate and to the link, friction at rest stops the shaft within a step, and a comparator opens all phases
+ * at an instant that is found by shortening the step of all of them.
+ *
  * With a DC-link capacitor the phases step in the order of time, and its voltage between their steps: link_steps.h. */
 #ifndef PLANT_PHASE_STEPS_H
 #define PLANT_PHASE_STEPS_H
