@@ -333,9 +333,10 @@ static void see_set(observation_t *seen, const uint8_t data[8]) {
         response.status != DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE) {
         return;
     }
-    if (response.value == DRIVE_PARAMETER_SET_CONTROL_STEP_SAVE_CHOICE) {
+    const unsigned step = (uint8_t)response.value; /* the counter of the request is above it */
+    if (step == DRIVE_PARAMETER_SET_CONTROL_STEP_SAVE_CHOICE) {
         limit->saved_ns = seen->time_ns;
-    } else if (response.value == DRIVE_PARAMETER_SET_CONTROL_STEP_APPLY_CHOICE) {
+    } else if (step == DRIVE_PARAMETER_SET_CONTROL_STEP_APPLY_CHOICE) {
         limit->applied++;
         limit->applied_ns = seen->time_ns;
     }
