@@ -2,6 +2,7 @@
 
 #include <math.h>
 
+#include "bench_variables.h"
 #include "fault_kinds.h"
 
 /* Default parameters of the drive. */
@@ -23,39 +24,28 @@ bool facts_disturbed(const observation_t *seen, uint32_t disturbs) {
 
 bool facts_disturbed_besides(const observation_t *seen, uint32_t disturbs, unsigned kind) {
     for (unsigned each = 1; each < FAULT_COUNT; each++) {
-        if (each != kind && seen->injected[each] && (fault_effect(each).disturbs & disturbs) != 0) {
+        if (each != kind && seen->present[each] && (fault_effect(each).disturbs & disturbs) != 0) {
             return true;
         }
     }
     return false;
 }
 
-bool facts_any_fault(const observation_t *seen) {
-    return seen->disturbed != 0;
+bool facts_ever_disturbed(const observation_t *seen, uint32_t disturbs) {
+    return (seen->ever_disturbed & disturbs) != 0;
+}
+
+bool facts_variable(const observation_t *seen, uint32_t disturbs) {
+    return (seen->variables & disturbs) != 0;
+}
+
+bool facts_bus_disturbed(const observation_t *seen) {
+    return facts_variable(seen, VARIABLE_LOSES_COMMANDS | VARIABLE_LOSES_STATUS) || seen->second_sender ||
+           seen->hostile_sender;
 }
 
 bool facts_undisturbed(const observation_t *seen) {
-    return !facts_any_fault(seen) && !seen->bus_disturbed;
-}
-
-bool facts_variable_begun(const observation_t *seen, uint32_t disturbs, uint64_t time_us) {
-    for (unsigned i = 0; i < seen->world->events; i++) {
-        const world_event_t *event = world_begun(seen->world, i, time_us);
-        if (event != NULL && event->kind == WORLD_SET && (variable_effect(event->what).disturbs & disturbs) != 0) {
-            return true;
-        }
-    }
-    return false;
-}
-
-bool facts_other_sender(const observation_t *seen, bool hostile, uint64_t time_us) {
-    for (unsigned i = 0; i < seen->world->events; i++) {
-        const world_event_t *event = world_begun(seen->world, i, time_us);
-        if (event != NULL && (event->kind == WORLD_SECOND || (hostile && event->kind == WORLD_HOSTILE))) {
-            return true;
-        }
-    }
-    return false;
+    return seen->disturbed == 0 && !facts_bus_disturbed(seen);
 }
 
 bool facts_sto_demanded(const observation_t *seen, uint64_t time_us) {
@@ -120,22 +110,22 @@ bool facts_state_changed(const observation_t *seen) {
     return facts_disturbed(seen, DISTURBS_STATE);
 }
 
-bool facts_checks_late(const observation_t *seen, uint64_t time_us) {
-    return facts_disturbed(seen, DISTURBS_PROCESSOR) || facts_variable_begun(seen, VARIABLE_DELAYS_INTERRUPTS, time_us);
+bool facts_checks_late(const observation_t *seen) {
+    return facts_disturbed(seen, DISTURBS_PROCESSOR) || facts_variable(seen, VARIABLE_DELAYS_INTERRUPTS);
 }
 
-bool facts_drive_disturbed(const observation_t *seen, uint64_t time_us) {
-    return facts_disturbed(seen, DISTURBS_MEMORY | DISTURBS_CLOCK) || facts_checks_late(seen, time_us);
+bool facts_drive_disturbed(const observation_t *seen) {
+    return facts_disturbed(seen, DISTURBS_MEMORY | DISTURBS_CLOCK) || facts_checks_late(seen);
 }
 
-bool facts_may_be_deaf(const observation_t *seen, uint64_t time_us) {
-    return facts_variable_begun(seen, VARIABLE_LOSES_COMMANDS | VARIABLE_DELAYS_INTERRUPTS, time_us) ||
-           facts_other_sender(seen, false, time_us) || facts_disturbed(seen, DISTURBS_BACKGROUND);
+bool facts_may_be_deaf(const observation_t *seen) {
+    return facts_variable(seen, VARIABLE_LOSES_COMMANDS | VARIABLE_DELAYS_INTERRUPTS) || seen->second_sender ||
+           facts_disturbed(seen, DISTURBS_BACKGROUND);
 }
 
 bool facts_frames_are_current(const observation_t *seen) {
-    return !seen->bus_disturbed && !facts_checks_late(seen, seen->time_ns / 1000) &&
-           !seen->injected[FAULT_CLOCK_DRIFT] && seen->time_ns >= seen->reset_ns + OLD_FRAMES_NS;
+    return !facts_bus_disturbed(seen) && !facts_checks_late(seen) && !seen->present[FAULT_CLOCK_DRIFT] &&
+           seen->time_ns >= seen->reset_ns + OLD_FRAMES_NS;
 }
 
 bool facts_speed_is_observed(const observation_t *seen) {
@@ -152,12 +142,24 @@ bool facts_runs_by_speed(const observation_t *seen) {
            facts_can_turn(seen);
 }
 
+/* After bus-off a request to run has no effect until it has been withdrawn, or the drive was reset. */
+static bool is_void(const observation_t *seen) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
+        if (event != NULL && event->kind == WORLD_SET && event->what == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER &&
+            seen->client.withdrawn_ns < event->begin_us * 1000 && seen->reset_ns < event->begin_us * 1000) {
+            return true;
+        }
+    }
+    return false;
+}
+
 bool facts_heard(const observation_t *seen) {
-    return seen->time_ns < seen->client.run_ns + HEARD_NS;
+    return seen->time_ns < seen->client.run_ns + HEARD_NS && !is_void(seen);
 }
 
 bool facts_pushed(const observation_t *seen) {
-    return facts_heard(seen) && !seen->bus_disturbed && facts_runs_by_speed(seen) &&
+    return facts_heard(seen) && !facts_bus_disturbed(seen) && facts_runs_by_speed(seen) &&
            fabs(seen->client.meant.reference) > PUSHING_SPEED * seen->world->machine->speed_base_rpm;
 }
 

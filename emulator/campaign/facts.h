@@ -7,23 +7,23 @@
 
 /* --- Faults and events of the world --- */
 
-/* A fault that disturbs any of these has begun (DISTURBS_*). */
+/* A fault that disturbs any of these is there, or was lately (DISTURBS_*). */
 bool facts_disturbed(const observation_t *seen, uint32_t disturbs);
 
 /* Likewise, of another kind than one. */
 bool facts_disturbed_besides(const observation_t *seen, uint32_t disturbs, unsigned kind);
 
-/* A fault of any kind has begun. */
-bool facts_any_fault(const observation_t *seen);
+/* A fault that disturbs any of these has begun, whether or not it has ended. */
+bool facts_ever_disturbed(const observation_t *seen, uint32_t disturbs);
 
-/* Neither a fault, nor a disturbed bus at any time. */
+/* A bench variable that does any of these is set, or was lately (VARIABLE_*). */
+bool facts_variable(const observation_t *seen, uint32_t disturbs);
+
+/* The bus is loaded, cut or shared with another sender, or was lately. */
+bool facts_bus_disturbed(const observation_t *seen);
+
+/* Neither a fault nor a disturbed bus. */
 bool facts_undisturbed(const observation_t *seen);
-
-/* A bench variable that does any of these has been set, whether or not it still is (VARIABLE_*). */
-bool facts_variable_begun(const observation_t *seen, uint32_t disturbs, uint64_t time_us);
-
-/* A second sender of valid frames; hostile: or one whose frames may be in the way of others. */
-bool facts_other_sender(const observation_t *seen, bool hostile, uint64_t time_us);
 
 /* A line of safe torque off is not energised. */
 bool facts_sto_demanded(const observation_t *seen, uint64_t time_us);
@@ -50,13 +50,13 @@ bool facts_four_quadrants(const observation_t *seen);
 bool facts_state_changed(const observation_t *seen);
 
 /* Late or lost interrupts and a background without time: what is checked is checked late. */
-bool facts_checks_late(const observation_t *seen, uint64_t time_us);
+bool facts_checks_late(const observation_t *seen);
 
 /* That, or memory or clock of the drive was changed. */
-bool facts_drive_disturbed(const observation_t *seen, uint64_t time_us);
+bool facts_drive_disturbed(const observation_t *seen);
 
 /* What was on the bus may not have reached the drive, or not in time. */
-bool facts_may_be_deaf(const observation_t *seen, uint64_t time_us);
+bool facts_may_be_deaf(const observation_t *seen);
 
 /* The frames of the drive are of the present: neither disturbed nor older than a reset. */
 bool facts_frames_are_current(const observation_t *seen);
@@ -71,7 +71,7 @@ bool facts_can_turn(const observation_t *seen);
 /* The drive runs by a command to turn at such a speed. */
 bool facts_runs_by_speed(const observation_t *seen);
 
-/* The client has been heard within the time after which the torque ramps to zero. */
+/* The client has been heard within the time after which the torque ramps to zero, and its request has an effect. */
 bool facts_heard(const observation_t *seen);
 
 /* The drive hears a command to turn at a speed that is none near zero. */

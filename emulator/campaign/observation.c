@@ -78,6 +78,37 @@ static const world_event_t *limited(const world_t *world) {
     return NULL;
 }
 
+/* A bus-off has no end of its own. */
+static bool is_present(const observation_t *seen, unsigned i) {
+    const world_event_t *event = world_begun(seen->world, i, (seen->time_ns + MS_NS) / 1000);
+    if (event == NULL) {
+        return false;
+    }
+    const bool momentary = event->kind == WORLD_SET && event->what == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER;
+    const uint64_t end_us = momentary ? event->begin_us : event->end_us != 0 ? event->end_us : UINT64_MAX / 2000;
+    return seen->time_ns < end_us * 1000 + OBSERVATION_AFTER_NS;
+}
+
+static void look_at_events(observation_t *seen) {
+    memset(seen->present, 0, sizeof seen->present);
+    seen->disturbed = seen->ever_disturbed & DISTURBS_MEMORY ? seen->disturbed & (DISTURBS_MEMORY | DISTURBS_STATE) : 0;
+    seen->variables = 0;
+    seen->second_sender = seen->hostile_sender = false;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = &seen->world->event[i];
+        if (!is_present(seen, i)) {
+            continue;
+        }
+        if (event->kind == WORLD_FAULT) {
+            seen->present[event->what] = true;
+            seen->disturbed |= fault_effect(event->what).disturbs;
+        }
+        seen->variables |= event->kind == WORLD_SET ? variable_effect(event->what).disturbs : 0;
+        seen->second_sender = seen->second_sender || event->kind == WORLD_SECOND;
+        seen->hostile_sender = seen->hostile_sender || event->kind == WORLD_HOSTILE;
+    }
+}
+
 void observation_start(observation_t *seen, const world_t *world, const plant_t *plant, uint64_t period_ns) {
     *seen = (observation_t){.world = world, .plant = plant, .period_ns = period_ns};
     seen->recent.voltage_low_V = INFINITY;
@@ -86,8 +117,7 @@ void observation_start(observation_t *seen, const world_t *world, const plant_t 
     seen->largest_flux_Wb = aligned.flux_linkage_Wb;
     seen->encoder_offset_rev = encoder_offset_rev(world);
     seen->limit.limited = limited(world);
-    seen->bus_disturbed = facts_variable_begun(seen, VARIABLE_LOSES_COMMANDS | VARIABLE_LOSES_STATUS, UINT64_MAX) ||
-                          facts_other_sender(seen, true, UINT64_MAX);
+    look_at_events(seen);
 }
 
 /* --- The plant --- */
@@ -165,6 +195,7 @@ void observation_on_look(observation_t *seen) {
 }
 
 void observation_on_millisecond(observation_t *seen) {
+    look_at_events(seen);
     observation_rotor_t *rotor = &seen->rotor;
     const double stroke_rad = facts_stroke_rad(seen), angle_rad = seen->plant->rotor_angle_rad;
     if (fabs(angle_rad - rotor->stroke_rad) > stroke_rad) {
@@ -362,7 +393,9 @@ void observation_on_fault(observation_t *seen, unsigned kind, bool begins) {
     seen->time_ns = seen->fault_ns = seen->plant->time_ns;
     if (begins && kind < FAULT_COUNT) {
         seen->injected[kind] = true;
+        seen->ever_disturbed |= fault_effect(kind).disturbs;
         seen->disturbed |= fault_effect(kind).disturbs;
+        seen->present[kind] = true;
     }
 }
 
@@ -385,6 +418,6 @@ void observation_at_end(observation_t *seen, observation_heat_t heat) {
     seen->time_ns = seen->plant->time_ns;
     seen->true_heat = heat;
     /* A drive takes an encoder for frozen until it counts, which at rest only a hand on the shaft or a reset ends. */
-    seen->recovery.held = facts_disturbed(seen, DISTURBS_ENCODER | DISTURBS_SHAFT) && !seen->recovery.restarted &&
+    seen->recovery.held = facts_ever_disturbed(seen, DISTURBS_ENCODER | DISTURBS_SHAFT) && !seen->recovery.restarted &&
                           fabs(seen->plant->speed_rad_s) < AT_REST_RAD_S;
 }

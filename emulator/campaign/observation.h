@@ -16,6 +16,9 @@
 #define OBSERVATION_KINDS_MAX 128           /* of faults */
 #define OBSERVATION_CAUSES_MAX 8
 
+/* After its end a disturbance may still show: in a filter, in an observer, in frames that wait. */
+#define OBSERVATION_AFTER_NS (200 * MS_NS)
+
 /* Temperatures of the hottest winding and of the hottest switch. */
 typedef struct {
     double winding_C, switch_C;
@@ -104,7 +107,6 @@ typedef struct {
     uint32_t limit_bits, constant_bits; /* of the drive's memory: a change of a higher one has no effect */
     double largest_flux_Wb;             /* aligned, at the trip current */
     double encoder_offset_rev;          /* on the shaft, in the direction of counting */
-    bool bus_disturbed;                 /* loaded, cut or shared with another sender at any time */
 
     observation_drive_t drive;
     uint8_t before;         /* state before the present control interrupt */
@@ -126,8 +128,14 @@ typedef struct {
     uint64_t reason_ns, reason_begin_ns; /* the plant had the last reason to keep the drive in a fault, since when */
 
     bool injected[OBSERVATION_KINDS_MAX]; /* kinds of faults that have begun, */
-    uint32_t disturbed;                   /* and what they disturb */
+    uint32_t ever_disturbed;              /* and what they disturb */
     uint64_t fault_ns;                    /* the last fault began or ended */
+
+    /* Present, or ended less than OBSERVATION_AFTER_NS ago; updated each millisecond. */
+    bool present[OBSERVATION_KINDS_MAX];
+    uint32_t disturbed; /* by faults, DISTURBS_*; memory that has changed stays so */
+    uint32_t variables; /* by bench variables, VARIABLE_* */
+    bool second_sender, hostile_sender;
 
     observation_client_t client;
     observation_recent_t recent;

@@ -8,7 +8,7 @@
 
 enum { ANNOUNCED = 3 }; /* besides the numbers of controllers */
 
-#define PART 1.3 /* single pulses near base speed take some electrical periods until their mean is right */
+#define PART 1.1 /* flux linkages of a machine scatter by 5 %, its torque by twice that */
 #define RATED 0.05
 #define RATED_HYSTERESIS 0.1
 #define MIN_NS (20 * MS_NS)
@@ -17,12 +17,6 @@ enum { ANNOUNCED = 3 }; /* besides the numbers of controllers */
 #define AGE_MAX_NS (120 * MS_NS)
 #define SETTLED_NS (100 * MS_NS)
 #define ROUNDED 1.03 /* of the limit in a frame */
-
-/* Tolerance: the BP-PID of `paper` takes tens of periods to open the outgoing phase, and the incoming one keeps its
- * current for the hand-over angle, which further on may alone make more than the reference. With fewer periods in a
- * stroke this takes most of it. */
-#define HAND_OVER_PERIODS 128.0
-#define HAND_OVER_PART 0.5 /* of the torque is judged then */
 
 typedef struct {
     mean_torque_t torque;
@@ -40,14 +34,7 @@ static void judge(const observation_t *seen, checker_report_t *report, double me
 static bool torque_is_known(const observation_t *seen) {
     return !facts_disturbed(seen, DISTURBS_PHASE | DISTURBS_CURRENT_SENSOR | DISTURBS_DC_LINK_SENSOR |
                                       DISTURBS_ENCODER | DISTURBS_PROCESSOR | DISTURBS_MEMORY | DISTURBS_CLOCK) &&
-           !seen->bus_disturbed;
-}
-
-static double part_judged(const observation_t *seen) {
-    const double period_rad = fabs(seen->plant->speed_rad_s) * (double)seen->period_ns * 1e-9;
-    const bool long_hand_over =
-        seen->world->controller == CONTROLLER_PAPER && HAND_OVER_PERIODS * period_rad > facts_stroke_rad(seen);
-    return long_hand_over ? HAND_OVER_PART : 1.0;
+           !facts_bus_disturbed(seen);
 }
 
 static void on_interrupt(const observation_t *seen, void *memory, checker_report_t *report) {
@@ -63,7 +50,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     if (!mean_torque_step(&state->torque, seen, MIN_NS, &mean_Nm)) {
         return;
     }
-    mean_Nm = part_judged(seen) * fabs(mean_Nm);
+    mean_Nm = fabs(mean_Nm);
     state->largest_Nm = fmax(state->largest_Nm, mean_Nm);
     if (facts_sets_in_effect(seen)) {
         judge(seen, report, mean_Nm, facts_torque_max_Nm(seen));

@@ -18,7 +18,7 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
     const uint64_t held_ns = observation_stays_ns(seen, &state->held, pushed, 0.25 * stroke_rad);
     const uint64_t swinging_ns = observation_stays_ns(seen, &state->swinging, pushed, stroke_rad);
     const uint64_t strokes_ns = pushed ? facts_strokes_ns(seen, 3.0) : 0;
-    const bool hidden = facts_checks_late(seen, seen->time_ns / 1000) || /* or the encoder shows a rotor that turns */
+    const bool hidden = facts_checks_late(seen) || /* or the encoder shows a rotor that turns */
                         facts_disturbed_besides(seen, DISTURBS_ANGLE, FAULT_ENCODER_STUCK);
     if ((held_ns > HELD_NS + strokes_ns || swinging_ns > SWINGING_NS + 2 * strokes_ns) && !hidden) {
         checker_violated(report, 0, (double)swinging_ns * 1e-6);

@@ -3,8 +3,6 @@
  * encoder counts; and not by a request to clear that was there before the fault. */
 #include "campaign/checkers/checker.h"
 
-#include "fault_kinds.h"
-
 enum { CLEARED_BEFORE = 4, CLEARED_UNCOUNTED, CLEARED_LINES }; /* besides STATE_INITIALISE and STATE_FAULT */
 
 #define STO_DIFFERED_US 215000 /* lines of safe torque off: then both have to be off once */
@@ -39,8 +37,8 @@ static void judge_fault(const observation_t *seen, checker_report_t *report) {
     if (known && seen->cause[seen->causes - 1] == CAUSE(ENCODER) && !seen->counted && !reset_since) {
         checker_violated(report, CLEARED_UNCOUNTED, 0.0);
     }
-    if (clear_ns != 0 && clear_ns + EARLIER_NS < seen->latched_ns && !reset_since &&
-        !facts_may_be_deaf(seen, seen->time_ns / 1000) && !facts_impersonated(seen)) {
+    if (clear_ns != 0 && clear_ns + EARLIER_NS < seen->latched_ns && !reset_since && !facts_may_be_deaf(seen) &&
+        !facts_impersonated(seen)) {
         checker_violated(report, CLEARED_BEFORE, (double)(seen->latched_ns - clear_ns) * 1e-6);
     }
 }
@@ -55,8 +53,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
         judge_fault(seen, report);
     }
     const uint64_t gone_ns = seen->before == STATE_FAULT ? GONE_NS : GONE_AT_START_NS;
-    const bool begins = seen->time_ns < seen->reason_begin_ns + UNSEEN_PERIODS * seen->period_ns ||
-                        (seen->before == STATE_INITIALISE && seen->injected[FAULT_SUPPLY_RIPPLE]);
+    const bool begins = seen->time_ns < seen->reason_begin_ns + UNSEEN_PERIODS * seen->period_ns;
     if (seen->reason_ns && seen->time_ns < seen->reason_ns + gone_ns && !begins &&
         !facts_disturbed(seen, DISTURBS_MEMORY | DISTURBS_CLOCK)) {
         checker_violated(report, seen->before, (double)(seen->time_ns - seen->reason_ns) * 1e-6);

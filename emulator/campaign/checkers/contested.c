@@ -13,7 +13,7 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
     (void)memory;
     const uint64_t now_us = seen->time_ns / 1000;
     if (seen->drive.state != STATE_RUN || facts_state_changed(seen) || seen->client.succeeded ||
-        facts_variable_begun(seen, VARIABLE_LOSES_COMMANDS, now_us)) {
+        facts_variable(seen, VARIABLE_LOSES_COMMANDS)) {
         return;
     }
     for (unsigned i = 0; i < seen->world->events; i++) {

@@ -6,7 +6,6 @@
 #include "fault_kinds.h"
 
 #define PHASE_CAUSES (CAUSE_BIT(CURRENT_SENSOR) | CAUSE_BIT(PHASE_OPEN) | CAUSE_BIT(PHASE_SHORTED))
-#define CURRENT_CAUSES (CAUSE_BIT(OVER_CURRENT) | CAUSE_BIT(HARDWARE_OVER_CURRENT))
 #define ENCODER_CAUSES (CAUSE_BIT(ENCODER) | CAUSE_BIT(ENCODER_ANGLE))
 #define OVERLOAD_CAUSES (CAUSE_BIT(WINDING_OVERLOAD) | CAUSE_BIT(INVERTER_OVERLOAD))
 #define COMMAND_CAUSES (CAUSE_BIT(COMMAND_TIMEOUT) | CAUSE_BIT(COMMAND_ERROR))
@@ -15,7 +14,7 @@
 #define OF_PHASE (DISTURBS_PHASE | DISTURBS_CURRENT_SENSOR)
 #define OF_SENSORS (OF_PHASE | DISTURBS_DC_LINK_SENSOR | DISTURBS_ENCODER)
 
-#define STALLED_NS (200 * MS_NS)
+#define STALLED_NS (100 * MS_NS) /* without a stroke */
 #define CONDUCTED_MAX_NS (250 * MS_NS)
 #define LOADED 0.9        /* of the torque that is left */
 #define LOADED_BACK 0.7   /* likewise, of one quadrant turned back */
@@ -67,9 +66,8 @@ static bool true_of_plant(const observation_t *seen, unsigned cause) {
  * should be, even when the link takes no energy. */
 static bool has_reason(const observation_t *seen, unsigned cause) {
     const sender_meaning_t *meant = &seen->client.meant;
-    const uint64_t now_us = seen->time_ns / 1000;
     const bool unsound = facts_disturbed(seen, OF_SENSORS | DISTURBS_SHAFT | DISTURBS_LOAD) ||
-                         facts_checks_late(seen, now_us) || facts_overhauled(seen, seen->plant->speed_rad_s);
+                         facts_checks_late(seen) || facts_overhauled(seen, seen->plant->speed_rad_s);
     const double near = facts_four_quadrants(seen) ? 0.97 : 0.8; /* an overshoot of one quadrant stays */
     const bool coasts = seen->dark_ns != 0 && seen->time_ns > seen->dark_ns + COASTING_NS;
     const bool near_limit =
@@ -77,7 +75,7 @@ static bool has_reason(const observation_t *seen, unsigned cause) {
     switch (cause) {
     case CAUSE(OVER_CURRENT):
     case CAUSE(HARDWARE_OVER_CURRENT):
-        return facts_disturbed(seen, OF_SENSORS | DISTURBS_SUPPLY) || facts_drive_disturbed(seen, now_us);
+        return facts_disturbed(seen, OF_SENSORS | DISTURBS_SUPPLY) || facts_drive_disturbed(seen);
     case CAUSE(OVER_SPEED):
         return unsound || near_limit;
     case CAUSE(OVER_VOLTAGE):
@@ -114,15 +112,6 @@ static bool conducts_alone(const observation_t *seen) {
     return conducting < 2;
 }
 
-/* One of the causes has been an earlier one. */
-static bool named(const observation_t *seen, uint32_t causes) {
-    bool any = false;
-    for (unsigned i = 0; i + 1 < seen->causes; i++) {
-        any = any || (causes >> seen->cause[i] & 1u);
-    }
-    return any;
-}
-
 static uint32_t causes_of_event(const world_event_t *event) {
     const bool clears = event->kind == WORLD_REQUEST && event->what == WORLD_REQUEST_CLEAR; /* refused in a run */
     switch (event->kind) {
@@ -141,7 +130,7 @@ static uint32_t causes_of_event(const world_event_t *event) {
 
 /* Causes that several faults together, or a fault from the start, cannot be told apart from. */
 static uint32_t causes_alike(const observation_t *seen) {
-    const bool of_phase = facts_disturbed(seen, OF_PHASE), of_encoder = facts_disturbed(seen, DISTURBS_ANGLE);
+    const bool of_phase = facts_ever_disturbed(seen, OF_PHASE), of_encoder = facts_ever_disturbed(seen, DISTURBS_ANGLE);
     const unsigned phases = facts_phases_at_fault(seen, seen->time_ns / 1000);
     uint32_t causes = 0;
     /* With one phase that has conducted lately a wrong current and a wrong angle, or one that does not move, are the
@@ -152,13 +141,6 @@ static uint32_t causes_alike(const observation_t *seen) {
     /* and two phases with faults of their own are what a wrong angle looks like. */
     if ((phases & (phases - 1u)) != 0) {
         causes |= CAUSE_BIT(ENCODER_ANGLE);
-    }
-    /* What has been named, and is run with again, is wrong from the start. */
-    if (of_encoder && named(seen, ENCODER_CAUSES)) {
-        causes |= PHASE_CAUSES;
-    }
-    if (of_phase && named(seen, PHASE_CAUSES | CURRENT_CAUSES)) {
-        causes |= ENCODER_CAUSES;
     }
     /* From a shorted switch through the earth flows a current that no drive can end, also before the first run. */
     if (seen->injected[FAULT_SWITCH_SHORTED] && seen->injected[FAULT_WINDING_TO_EARTH]) {
@@ -171,7 +153,7 @@ explanation_t explanation_of_fault(const observation_t *seen) {
     const unsigned cause = seen->drive.fault;
     uint32_t causes = causes_alike(seen), of_events = 0;
     for (unsigned kind = 1; kind < FAULT_COUNT; kind++) {
-        causes |= seen->injected[kind] ? fault_effect(kind).causes : 0;
+        causes |= seen->present[kind] ? fault_effect(kind).causes : 0;
     }
     for (unsigned i = 0; i < seen->world->events; i++) {
         const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
@@ -180,6 +162,6 @@ explanation_t explanation_of_fault(const observation_t *seen) {
     causes |= of_events;
     return (explanation_t){
         .explained = (causes >> cause & 1u) || (true_of_plant(seen, cause) && has_reason(seen, cause)),
-        .any = facts_any_fault(seen) || of_events != 0,
+        .any = seen->ever_disturbed != 0 || of_events != 0,
     };
 }

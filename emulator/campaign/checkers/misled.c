@@ -24,8 +24,7 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
                         facts_largest_current_A(seen) > CURRENT_MIN * machine->trip_current_A &&
                         fabs(error_pitches) > ERROR_PITCHES;
     observation_since(&state->since_ns, misled, seen->time_ns);
-    if (state->since_ns && seen->time_ns > state->since_ns + TIME_NS &&
-        !facts_checks_late(seen, seen->time_ns / 1000)) {
+    if (state->since_ns && seen->time_ns > state->since_ns + TIME_NS && !facts_checks_late(seen)) {
         checker_violated(report, 0, error_pitches);
     }
 }

@@ -15,10 +15,9 @@ static void on_frame(const observation_t *seen, void *memory, checker_report_t *
 
 static void on_millisecond(const observation_t *seen, void *memory, checker_report_t *report) {
     const state_t *state = memory;
-    const uint64_t now_us = seen->time_ns / 1000;
     const uint64_t heard_ns = state->status_ns > seen->reset_ns ? state->status_ns : seen->reset_ns;
-    if (seen->time_ns > heard_ns + TIME_NS && !facts_variable_begun(seen, VARIABLE_LOSES_STATUS, now_us) &&
-        !facts_checks_late(seen, now_us) && !facts_other_sender(seen, true, now_us)) {
+    if (seen->time_ns > heard_ns + TIME_NS && !facts_variable(seen, VARIABLE_LOSES_STATUS) &&
+        !facts_checks_late(seen) && !seen->second_sender && !seen->hostile_sender) {
         checker_violated(report, 0, (double)(seen->time_ns - heard_ns) * 1e-6);
     }
 }

@@ -18,12 +18,12 @@ static void on_look(const observation_t *seen, void *memory, checker_report_t *r
     (void)memory;
     const observation_client_t *client = &seen->client;
     const uint64_t now_ns = seen->time_ns;
-    const bool deaf = facts_may_be_deaf(seen, now_ns / 1000);
+    const bool deaf = facts_may_be_deaf(seen);
     if (!seen->gates) {
         return;
     }
-    if (client->unacknowledged && !facts_state_changed(seen) && !facts_impersonated(seen) &&
-        !facts_other_sender(seen, true, (now_ns - 1) / 1000)) {
+    if (client->unacknowledged && !facts_state_changed(seen) && !facts_impersonated(seen) && !seen->second_sender &&
+        !seen->hostile_sender) {
         checker_violated(report, AFTER_A_RESET, (double)(now_ns - seen->reset_ns) * 1e-6);
     }
     if (!client->confirmed && !deaf) {
@@ -49,9 +49,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
         checker_violated(report, IN_RUN_WITHOUT_A_COMMAND, (double)(now_ns - run_ns) * 1e-6);
     }
     const bool ends = seen->before == STATE_FAULT && seen->drive.state != STATE_FAULT;
-    const bool to_run = seen->drive.state == STATE_RUN; /* another number */
-    if (ends && !to_run && !seen->client.clear_seen && !facts_may_be_deaf(seen, now_ns / 1000) &&
-        !facts_impersonated(seen)) {
+    if (ends && !seen->client.clear_seen && !facts_may_be_deaf(seen) && !facts_impersonated(seen)) {
         checker_violated(report, FAULT_CLEARED, 0.0);
     }
 }

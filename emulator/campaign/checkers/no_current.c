@@ -33,7 +33,7 @@ static void on_look(const observation_t *seen, void *memory, checker_report_t *r
     /* Looks meet a pulse once more than it has of their steps. */
     const double short_Wb = step_Wb + PULSE_PERIODS * plant->bus_voltage_V * (double)seen->period_ns * 1e-9;
     const bool hidden = facts_disturbed(seen, DISTURBS_CURRENT_SENSOR | DISTURBS_DC_LINK_SENSOR) ||
-                        seen->injected[FAULT_DIODE_OPEN] || facts_checks_late(seen, seen->time_ns / 1000);
+                        seen->present[FAULT_DIODE_OPEN] || facts_checks_late(seen);
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
         double *flux_Wb = &state->flux_Wb[phase], *pulse_Wb = &state->pulse_Wb[phase];
         if (seen->drive.state != STATE_RUN || plant_current_A(plant, phase) > NO_CURRENT_A) {

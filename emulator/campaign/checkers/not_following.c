@@ -1,6 +1,5 @@
 /* Undisturbed, at a constant speed reference and under a constant load, the mean speed over 50 ms and a revolution is
- * the commanded one: within 0.3 %, 0.1 % of the base speed and a count; of one quadrant not below it by 2 %, with its
- * sliding mode by 10 %. */
+ * the commanded one: within 0.3 %, 0.1 % of the base speed and a count; of one quadrant not below it by 2 %. */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>
@@ -8,14 +7,11 @@
 #define ERROR_MAX_QUADRANTS 0.003
 #define ERROR_MAX_BASE_QUADRANTS 0.001
 #define ERROR_MAX 0.02
-#define ERROR_MAX_SMC 0.1    /* which hunts with a light rotor */
 #define ERROR_MAX_BASE 0.002 /* of the base speed */
 #define SETTLED_S 0.15       /* after the time that half of the torque limit needs */
 #define MIN_S 0.05
 #define SPEED_MAX 0.9 /* of the base speed */
 #define LOAD_SETTLED_US 250000
-#define COARSE_BITS 12
-#define COARSE_SPEED 0.05 /* of the base speed, at which a coarse encoder counts too seldom */
 
 typedef struct {
     uint64_t begin_ns; /* 0: begins with the next sample */
@@ -44,18 +40,16 @@ static bool follows(const observation_t *seen) {
     const double reference_rpm = fabs(client->meant.reference), base_rpm = seen->world->machine->speed_base_rpm;
     const double change_rad_s = reference_rpm / RPM_PER_RAD_S + fabs(client->begin_speed_rad_s);
     const uint64_t since_ns = client->constant_ns > seen->state_ns ? client->constant_ns : seen->state_ns;
-    const bool coarse = seen->world->encoder_bits < COARSE_BITS && reference_rpm < COARSE_SPEED * base_rpm;
-    return facts_runs_by_speed(seen) && facts_undisturbed(seen) && !coarse && !facts_derated(seen) &&
-           facts_heard(seen) &&
+    return facts_runs_by_speed(seen) && facts_undisturbed(seen) && !facts_derated(seen) && facts_heard(seen) &&
            seen->time_ns > since_ns + (uint64_t)((SETTLED_S + facts_needed_s(seen, change_rad_s)) * 1e9) &&
            reference_rpm <= SPEED_MAX * base_rpm && !facts_overhauled(seen, seen->plant->speed_rad_s) &&
            load_is_constant(seen);
 }
 
 static void judge(const observation_t *seen, checker_report_t *report, double mean_rad_s, double time_s) {
-    const bool quadrants = facts_four_quadrants(seen), smc = seen->world->controller == CONTROLLER_PAPER;
+    const bool quadrants = facts_four_quadrants(seen);
     const double reference_rad_s = seen->client.meant.reference / RPM_PER_RAD_S;
-    const double part = quadrants ? ERROR_MAX_QUADRANTS : smc ? ERROR_MAX_SMC : ERROR_MAX;
+    const double part = quadrants ? ERROR_MAX_QUADRANTS : ERROR_MAX;
     const double part_base = quadrants ? ERROR_MAX_BASE_QUADRANTS : ERROR_MAX_BASE;
     const double count_rad_s = ldexp(TWO_PI, -(int)seen->world->encoder_bits) / time_s;
     const double most_rad_s = part * fabs(reference_rad_s) + part_base * facts_base_rad_s(seen) + count_rad_s;

@@ -7,10 +7,11 @@
 
 enum { NOT_IN_RUN = 1, NOT_AT_SPEED, FAULT_AGAIN, PHASE_LEFT_OUT };
 
-#define STO_DIFFERED_US 195000 /* lines of safe torque off: then both have to be without energy once */
-#define SENSOR_HEAT_US 100000  /* a drive takes a current that its sensor has shown for so long for heat */
-#define SWITCH_COOL_C 80.0     /* a warmer switch takes away torque: from the limit of 100 C on the run */
-#define TURNED_PITCHES 2.0     /* then every phase has had its turn */
+#define STO_DIFFERED_US 195000     /* lines of safe torque off: then both have to be without energy once */
+#define SENSOR_HEAT_US 100000      /* a drive takes a current that its sensor has shown for so long for heat */
+#define SWITCH_COOL_C 80.0         /* a warmer switch takes away torque: from the limit of 100 C on the run */
+#define CONFLICT_NS (1150 * MS_NS) /* and until the drive has been cleared and started */
+#define TURNED_PITCHES 2.0         /* then every phase has had its turn */
 
 typedef struct {
     unsigned used; /* bit of each phase with a gate on since the drive runs again */
@@ -28,7 +29,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     (void)memory;
     const observation_recovery_t *recovery = &seen->recovery;
     if (seen->drive.state == STATE_FAULT && seen->before != STATE_FAULT && recovery->restarted && recovery->judged &&
-        !recovery->settled && !seen->bus_disturbed) {
+        !recovery->settled && !facts_bus_disturbed(seen)) {
         checker_violated(report, FAULT_AGAIN, seen->drive.fault);
     }
 }
@@ -56,18 +57,31 @@ static bool heated_by_sensor(const observation_t *seen) {
     return false;
 }
 
+/* A foreign frame with an identifier of the drive is a conflict for a second. */
+static bool identifiers_conflict(const observation_t *seen) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, UINT64_MAX);
+        if (event != NULL && event->kind == WORLD_HOSTILE &&
+            (event->what == WORLD_HOSTILE_IDENTITY || event->what == WORLD_HOSTILE_FLOOD) &&
+            seen->time_ns < event->end_us * 1000 + CONFLICT_NS) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* What keeps a drive in a fault is still there: memory that has changed, until a reset; safe torque off; heat. */
 static bool cause_remains(const observation_t *seen) {
     const uint8_t last = seen->causes ? seen->cause[seen->causes - 1] : 0;
-    return facts_disturbed(seen, DISTURBS_MEMORY) || lines_differed(seen) || heated_by_sensor(seen) || seen->surged ||
-           seen->true_heat.switch_C > SWITCH_COOL_C || last == CAUSE(WINDING_OVERLOAD) ||
-           last == CAUSE(INVERTER_OVERLOAD) || last == CAUSE(IDENTIFIER_CONFLICT);
+    return facts_ever_disturbed(seen, DISTURBS_MEMORY) || lines_differed(seen) || heated_by_sensor(seen) ||
+           seen->surged || seen->true_heat.switch_C > SWITCH_COOL_C || last == CAUSE(WINDING_OVERLOAD) ||
+           last == CAUSE(INVERTER_OVERLOAD) || identifiers_conflict(seen);
 }
 
 static void at_end(const observation_t *seen, void *memory, checker_report_t *report) {
     const state_t *state = memory;
     const observation_recovery_t *recovery = &seen->recovery;
-    if (recovery->held || !recovery->judged || seen->bus_disturbed || cause_remains(seen)) {
+    if (recovery->held || !recovery->judged || cause_remains(seen)) {
         return;
     }
     if (!recovery->restarted) {

@@ -5,7 +5,7 @@
 #define LOOKS 2
 
 typedef struct {
-    unsigned looks; /* in succession with a current above */
+    unsigned looks[HAL_PHASES_MAX]; /* in succession with a current above */
 } state_t;
 
 /* Tolerance: what the current rises by in a control period, before the comparator's response is latched. */
@@ -19,19 +19,15 @@ static double rise_A(const observation_t *seen, unsigned phase, double current_A
 static void on_look(const observation_t *seen, void *memory, checker_report_t *report) {
     state_t *state = memory;
     const double threshold_A = seen->plant->machine->trip_current_A;
-    bool above = false;
-    for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {
+    for (unsigned phase = 0; phase < seen->plant->machine->phases && threshold_A != 0.0; phase++) {
         const double current_A = plant_current_A(seen->plant, phase);
-        if (threshold_A == 0.0 || !(seen->gates >> phase & 1u) || current_A <= threshold_A ||
-            current_A <= threshold_A + rise_A(seen, phase, current_A)) {
-            continue;
-        }
-        above = true;
-        if (++state->looks >= LOOKS) {
+        const bool above = seen->plant->switches[phase] != 0 && current_A > threshold_A &&
+                           current_A > threshold_A + rise_A(seen, phase, current_A);
+        state->looks[phase] = above ? state->looks[phase] + 1 : 0;
+        if (state->looks[phase] >= LOOKS) {
             checker_violated(report, phase, current_A / threshold_A);
         }
     }
-    state->looks = above ? state->looks : 0;
 }
 
 const checker_t over_current_checker = {.name = "over_current", .state_size = sizeof(state_t), .on_look = on_look};

@@ -27,7 +27,7 @@ static double shown_speed(const world_t *world) {
 /* Tolerance: an encoder that is frozen, or does not answer from a start on, shows nothing while the load turns a rotor
  * without current. No drive has another sign of it. */
 static bool turns_unseen(const observation_t *seen) {
-    return (seen->injected[FAULT_ENCODER_STUCK] || seen->injected[FAULT_ENCODER_NO_ANSWER]) &&
+    return (seen->present[FAULT_ENCODER_STUCK] || seen->injected[FAULT_ENCODER_NO_ANSWER]) &&
            facts_overhauled(seen, seen->plant->speed_rad_s);
 }
 

@@ -29,12 +29,12 @@ static unsigned lost_phases(const observation_t *seen) {
 static void on_millisecond(const observation_t *seen, void *memory, checker_report_t *report) {
     state_t *state = memory;
     const double reference_rad_s = fabs(seen->client.meant.reference) / RPM_PER_RAD_S;
-    const bool drives = facts_heard(seen) && !seen->bus_disturbed && facts_runs_by_speed(seen) &&
+    const bool drives = facts_heard(seen) && !facts_bus_disturbed(seen) && facts_runs_by_speed(seen) &&
                         reference_rad_s * RPM_PER_RAD_S > SPEED_MIN * seen->world->machine->speed_base_rpm &&
                         fabs(seen->plant->speed_rad_s) < 0.5 * reference_rad_s;
     observation_since(&state->since_ns, drives && lost_phases(seen) > 1, seen->time_ns);
     if (state->since_ns && seen->time_ns > state->since_ns + TIME_NS &&
-        seen->time_ns > seen->client.constant_ns + TIME_NS && !facts_checks_late(seen, seen->time_ns / 1000)) {
+        seen->time_ns > seen->client.constant_ns + TIME_NS && !facts_checks_late(seen)) {
         checker_violated(report, 0, seen->plant->speed_rad_s);
     }
 }

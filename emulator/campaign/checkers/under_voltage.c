@@ -14,8 +14,7 @@ static void on_look(const observation_t *seen, void *memory, checker_report_t *r
     const bool low = seen->drive.state == STATE_RUN && !facts_disturbed(seen, DISTURBS_DC_LINK_SENSOR) &&
                      link_V < PART * threshold_V;
     observation_since(&state->since_ns, low, seen->time_ns);
-    if (state->since_ns && seen->time_ns > state->since_ns + TIME_NS &&
-        !facts_drive_disturbed(seen, seen->time_ns / 1000)) {
+    if (state->since_ns && seen->time_ns > state->since_ns + TIME_NS && !facts_drive_disturbed(seen)) {
         checker_violated(report, 0, link_V / threshold_V);
     }
 }

@@ -45,7 +45,7 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
         const uint64_t begin_ns = event->begin_us * 1000;
         const uint64_t since_ns = begin_ns > seen->state_ns ? begin_ns : seen->state_ns;
         const bool of_processor = (effect.disturbs & DISTURBS_PROCESSOR) != 0;
-        if (within_ns && seen->time_ns > since_ns + within_ns && (of_processor || !facts_checks_late(seen, now_us))) {
+        if (within_ns && seen->time_ns > since_ns + within_ns && (of_processor || !facts_checks_late(seen))) {
             checker_violated(report, event->what, event->value);
         }
     }

@@ -57,7 +57,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     const double mean_counts = state->error_counts / state->samples;
     const double tick_counts = fabs(seen->plant->speed_rad_s) / TWO_PI * TIMER_TICK_S * counts_per_rev;
     if (fabs(mean_counts) > ERROR_MAX_COUNTS + tick_counts && !facts_disturbed(seen, DISTURBS_ENCODER) &&
-        !facts_drive_disturbed(seen, seen->time_ns / 1000)) {
+        !facts_drive_disturbed(seen)) {
         checker_violated(report, 0, mean_counts);
     }
     state->samples = 0;

@@ -10,7 +10,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     (void)memory;
     const double range_A = seen->plant->machine->ranges.current_A;
     if (seen->fault_ns == seen->time_ns || /* a fault may have come between the samples and this instant */
-        facts_disturbed(seen, DISTURBS_CURRENT_SHOWN) || facts_drive_disturbed(seen, seen->time_ns / 1000)) {
+        facts_disturbed(seen, DISTURBS_CURRENT_SHOWN) || facts_drive_disturbed(seen)) {
         return;
     }
     for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {

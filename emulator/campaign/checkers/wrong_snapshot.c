@@ -14,7 +14,7 @@ enum { SPEED = 16, LINK_VOLTAGE, CURRENT };
 
 typedef struct {
     double speed_rpm, voltage, current; /* when the fault was latched; as fractions of the full scales */
-    bool ran;                           /* for long until then */
+    bool observed;                      /* the speed, by a run of long until then */
 } state_t;
 
 static void on_interrupt(const observation_t *seen, void *memory, checker_report_t *report) {
@@ -23,9 +23,10 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     if (seen->drive.state != STATE_FAULT || seen->before == STATE_FAULT) {
         return;
     }
-    *state = (state_t){.speed_rpm = seen->plant->speed_rad_s * RPM_PER_RAD_S,
-                       .voltage = seen->drive.link_voltage,
-                       .ran = seen->before == STATE_RUN && seen->before_ns > RAN_NS};
+    *state =
+        (state_t){.speed_rpm = seen->plant->speed_rad_s * RPM_PER_RAD_S,
+                  .voltage = seen->drive.link_voltage,
+                  .observed = seen->before == STATE_RUN && seen->before_ns > RAN_NS && facts_speed_is_observed(seen)};
     for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {
         state->current = fmax(state->current, seen->drive.current[phase]);
     }
@@ -48,7 +49,7 @@ static void on_frame(const observation_t *seen, void *memory, checker_report_t *
     }
     struct drive_fault_snapshot_t snapshot;
     drive_fault_snapshot_unpack(&snapshot, frame->data, 8);
-    if (state->ran && facts_speed_is_observed(seen)) {
+    if (state->observed) {
         const double error_rpm =
             SPEED_ERROR_MAX * fabs(state->speed_rpm) + SPEED_ERROR_MAX_BASE * machine->speed_base_rpm;
         judge(report, SPEED, snapshot.speed_rpm * SPEED_LSBS * machine->command_lsb_rpm, state->speed_rpm, error_rpm);

@@ -11,7 +11,8 @@ static void on_frame(const observation_t *seen, void *memory, checker_report_t *
     struct drive_status_t status;
     drive_status_unpack(&status, frame->data, 8);
     const bool differs = status.state != seen->drive.state || status.fault != seen->drive.fault;
-    if (differs && seen->time_ns > seen->state_ns + AGE_MAX_NS && !facts_state_changed(seen) && !seen->bus_disturbed) {
+    if (differs && seen->time_ns > seen->state_ns + AGE_MAX_NS && !facts_state_changed(seen) &&
+        !facts_bus_disturbed(seen)) {
         checker_violated(report, status.state, status.fault);
     }
 }

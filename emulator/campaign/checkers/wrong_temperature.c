@@ -16,7 +16,7 @@ static void judge(checker_report_t *report, unsigned number, double measured_C, 
 
 static void at_end(const observation_t *seen, void *memory, checker_report_t *report) {
     (void)memory;
-    if (facts_drive_disturbed(seen, UINT64_MAX) || facts_disturbed(seen, DISTURBS_TEMPERATURE_SENSOR)) {
+    if (facts_drive_disturbed(seen) || facts_disturbed(seen, DISTURBS_TEMPERATURE_SENSOR)) {
         return;
     }
     judge(report, WINDING, seen->drive.heat.winding_C, seen->true_heat.winding_C);

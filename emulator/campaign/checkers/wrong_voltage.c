@@ -11,7 +11,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     const double truth = fmin(fmax(seen->plant->bus_voltage_V / range_V, 0.0), 1.0);
     if (seen->fault_ns != seen->time_ns && /* a fault may have come between the samples and this instant */
         fabs(measured - truth) > ERROR_MAX && !facts_disturbed(seen, DISTURBS_DC_LINK_SENSOR) &&
-        !facts_drive_disturbed(seen, seen->time_ns / 1000)) {
+        !facts_drive_disturbed(seen)) {
         checker_violated(report, 0, measured * range_V);
     }
 }

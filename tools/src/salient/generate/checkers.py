@@ -21,7 +21,9 @@ Generated from `checkers/` by `python -m salient.generate.checkers`; do not edit
 
 Each judges one property of every world, from true values of the plant, the faults that are there, what the clients
 meant, and of the drive its state, its first cause and its measurements (`observation.h`). What each fault disturbs and
-which causes it may have is in `fault_effects.c`.
+which causes it may have is in `fault_effects.c`. A disturbance excuses while it is there and for 200 ms after its end.
+A rule has no exception for a weakness of the drive: deviations that are known are in `tests/campaign/known.toml`, by
+seed.
 """
 
 _GROUPS = {

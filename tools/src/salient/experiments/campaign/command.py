@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.experiments.campaign import canaries, names
-from salient.experiments.campaign.failure import Failure, load, replay, save
+from salient.experiments.campaign import canaries, known, names
+from salient.experiments.campaign.failure import Failure, classes, load, replay, save
 from salient.experiments.campaign.runner import ALL_EVENTS, Result, commit, digest, processor_s, serve, world
 from salient.experiments.tasks import Task, read_results, run
 from salient.paths import make_folder
@@ -33,12 +33,12 @@ def run_campaign(options: argparse.Namespace) -> int:
     mine = tasks[options.shard[0] - 1::options.shard[1]]
     results: list[Result] = []
     new: list[Result] = []
-    known, begin_s = read_results(options.out).keys(), processor_s()
+    earlier, begin_s = read_results(options.out).keys(), processor_s()
     with Progress(_LINES, sys.stderr, len(mine)) as progress:
         done = run(tasks, serve, options.out, options.shard, options.scheduler, options.jobs)
         for number, (task, result) in enumerate(done, start=1):
             results.append(result)
-            new += [] if task.key in known else [result]
+            new += [] if task.key in earlier else [result]
             progress.item(f"{number} of {len(mine)} seeds")
     note = summary(results, options.first, options.seeds, kind)
     spent_s = processor_s() - begin_s
@@ -72,6 +72,8 @@ def _folder_name(seed: int, violation: str, saved_seeds: Collection[int]) -> str
 def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dict[str, Any]:
     """Totals of the results of a range of seeds."""
     found: dict[str, list[int]] = defaultdict(list)
+    deviations: dict[str, list[int]] = defaultdict(list)
+    gone: list[str] = []
     cells: set[int] = set()
     content = hashlib.sha256()
     virtual_us = finished = recovered = held = rejected = 0
@@ -83,19 +85,27 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
         held += result.get("held", False)
         rejected += result.get("rejected", False)
         cells.update(result.get("cells", ()))
-        for violation in {names.violation(violation) for violation in result.get("violations", ())}:
-            found[violation].append(result["seed"])
+        classes = {names.violation(violation) for violation in result.get("violations", ())}
+        listed = known.of_world(int(result["seed"]), kind == "healthy")
+        for violation in classes:
+            (deviations if violation in listed else found)[violation].append(result["seed"])
+        gone += [f"{result['seed']} {violation}" for violation in sorted(listed - classes)]
     missing = [] if kind == "healthy" else [cell for cell in names.cells() if cell not in cells]
-    by_number = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
     return {
         "kind": kind, "first": first, "seeds": seeds, "finished": finished, "commit": commit(),
         "program_and_machines": digest(), "results_sha256": content.hexdigest(),
         "virtual_hours": round(virtual_us / 3.6e9, 4), "rejected": rejected,
         "recovered": recovered, "held_by_the_encoder": held,
-        "violations": {name: {"count": len(seeds_of), "seeds": seeds_of[:_SHOWN_MAX]} for name, seeds_of in by_number},
+        "violations": _by_number(found), "known_deviations": _by_number(deviations), "known_and_gone": gone,
         "cells_reached": len(cells), "cells": 0 if kind == "healthy" else len(names.cells()),
         "cells_not_reached": [names.cell(cell) for cell in missing],
     }
+
+
+def _by_number(found: dict[str, list[int]]) -> dict[str, Any]:
+    """Count and first seeds of each class, the most frequent one first."""
+    by_number = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
+    return {name: {"count": len(seeds), "seeds": seeds[:_SHOWN_MAX]} for name, seeds in by_number}
 
 
 def _virtual_s(results: list[Result]) -> float:
@@ -104,12 +114,15 @@ def _virtual_s(results: list[Result]) -> float:
 
 def report(note: dict[str, Any]) -> list[str]:
     """A summary to be read."""
-    number = sum(entry["count"] for entry in note["violations"].values())
+    number, deviations = (sum(entry["count"] for entry in note[of].values())
+                          for of in ("violations", "known_deviations"))
     lines = [f"{note['finished']} {'healthy worlds' if note['kind'] == 'healthy' else 'worlds with faults'} "
              f"from seed {note['first']}, {note['virtual_hours']:g} h of virtual time, commit {note['commit']}: "
-             f"{number} violations"]
-    lines += [f"  {name}: {entry['count']}, first seeds {', '.join(map(str, entry['seeds']))}"
-              for name, entry in note["violations"].items()]
+             f"{number} violations, {deviations} known deviations"]
+    lines += [f"  {kind}{name}: {entry['count']}, first seeds {', '.join(map(str, entry['seeds']))}"
+              for of, kind in (("violations", ""), ("known_deviations", "known: ")) for name, entry in note[of].items()]
+    lines += [f"  no longer a deviation, to be removed from {known.FILE.name}: seed {each}"
+              for each in note["known_and_gone"]]
     if note["cells"]:
         lines.append(f"cells of fault, state and sector: {note['cells_reached']} of {note['cells']} reached")
         left = note["cells_not_reached"]
@@ -150,11 +163,14 @@ def run_replay(options: argparse.Namespace) -> int:
               + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
     again = replay(seed, kept, healthy, folder, options.build, programs)
+    whole = kept == ALL_EVENTS and failure.canary is None
+    listed = known.of_world(seed, healthy) if whole else set()
     for violation in again.campaign["violations"]:
-        print(f"violation: {names.violation(violation)} at {violation['at_us']} us")
+        word = "known deviation" if names.violation(violation) in listed else "violation"
+        print(f"{word}: {names.violation(violation)} at {violation['at_us']} us")
     causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign.get("causes", []))
     print(f"first causes: {causes or 'none'}")
     result = f"hash {again.hash}" if again.hash else "the emulator crashed"
     print(f"{result}, {'equal to' if again.equal else 'NOT that of'} the campaign's; log and plot: {folder}")
-    return 0 if again.equal and not again.campaign["violations"] else 1
+    return 0 if again.equal and set(classes(again.campaign)) <= listed else 1
 

@@ -43,7 +43,9 @@ def _violations(note: Note) -> str:
     total = sum(entry["count"] for entry in note["violations"].values())
     listed = "; ".join(f"{entry['count']} `{name}`, seeds {', '.join(map(str, entry['seeds']))}"
                        for name, entry in note["violations"].items())
-    return f"{total:,} violation{'' if total == 1 else 's'}" + (f" ({listed})" if listed else "")
+    known = sum(entry["count"] for entry in note.get("known_deviations", {}).values())  # a judge before had no list
+    return (f"{total:,} violation{'' if total == 1 else 's'}" + (f" ({listed})" if listed else "")
+            + (f", {known:,} known deviations" if known else ""))
 
 
 def _rate(name: str) -> list[str]:
