@@ -1,4 +1,4 @@
-"""Worlds by seed: equal bits everywhere, results that merge, failures that shrink and replay, bugs that are found."""
+"""Worlds by seed: equal bits everywhere, results that merge, failures that shrink and replay."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from salient.bench.programs import executable
 from salient.cli import make_parser
 from salient.errors import RunFailed, UsageError, exit_code
 from salient.experiments import fault_table
-from salient.experiments.campaign import canaries, command, names, report, same_bits
+from salient.experiments.campaign import command, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import classes, replay
@@ -266,36 +266,6 @@ def test_a_measurement_names_the_command_that_builds_what_it_misses(tmp_path: Pa
             executable(build)
 
 
-def test_the_text_of_every_canary_is_in_its_file_once() -> None:
-    assert len({canary.name for canary in canaries.canaries()}) == 57
-
-
-def test_a_planted_bug_is_found_within_seconds_shrinks_and_replays(tmp_path: Path) -> None:
-    found = canaries.measure(1, tmp_path)
-    assert found["violation"] == "no_command: fault cleared" and found["replays"] and len(found["events"]) == 1
-    assert 0.001 < found["processor_s"] < 10.0 and 0.001 < found["shrinking_s"] < 60.0
-    note = json.loads((tmp_path / "1" / "failure.json").read_text(encoding="utf-8"))
-    assert note["replay"] == found["command"] == f"tools/salient replay {tmp_path / '1'}"
-    page = (tmp_path / "1" / "failure.html").read_text(encoding="utf-8")
-    at_us = note["result"]["violations"][0]["at_us"]
-    assert f"no_command: fault cleared at {at_us} us" in page and "The violation" in page and note["replay"] in page
-    (tmp_path / "failure.json").write_text(json.dumps({**note, "canary": None}), encoding="utf-8")
-    done = salient("replay", tmp_path)  # the drive without the bug
-    assert done.returncode == 0 and "violation" not in done.stdout
-
-
-def test_an_angle_that_is_a_count_off_is_found() -> None:
-    found = canaries.hunt(canaries.build(20), seeds_max=20)
-    assert found is not None and found.violation == "wrong_angle" and found.processor_s < 10.0
-
-
-def test_a_planted_bug_is_replayed_on_the_host_alone(tmp_path: Path) -> None:
-    note = {"seed": 4, "kept": "0x0", "healthy": False, "canary": 1}
-    (tmp_path / "failure.json").write_text(json.dumps(note), encoding="utf-8")
-    done = salient("replay", tmp_path, "--target", "rv32")
-    assert done.returncode == 2 and "--target rv32" in done.stderr and done.stderr.count("\n") == 1
-
-
 NOT_FAULTY = {"load_dropped", "winding_temperature_sensor_offset", "inverter_temperature_sensor_offset"}
 """Faults that change nothing which a drive should answer."""
 
@@ -336,7 +306,7 @@ def test_the_pages_show_the_committed_results() -> None:
     assert report.page() == report.PAGE.read_text(encoding="utf-8")
     page = fault_table.PAGE.read_text(encoding="utf-8")
     assert fault_table.with_branches(page) == page
-    assert report.table().count("\n") == 9 and "57 of 57 found" in report.table()
+    assert report.table().count("\n") == 9
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

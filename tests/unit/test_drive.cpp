@@ -556,6 +556,18 @@ TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_a
     }
 }
 
+TEST_F(Drive, a_second_ramp_to_zero_begins_at_the_torque_of_its_time) {
+    periods(100);
+    command(COMMAND_RUN, 1000.0);
+    periods(3);
+    for (const int torque_Nm : {5, 2}) {
+        hal.to_drive.push_back(frames::torque_command(++counter, COMMAND_RUN, torque_Nm << 16));
+        periods(75000 / 25); // a quarter of the ramp, from 50 to 150 ms
+        EXPECT_NEAR(drive.control.torque_reference_q24, 0.75 * (torque_Nm << 24), 0.02 * (torque_Nm << 24));
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    }
+}
+
 TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     periods(100);
     command(COMMAND_RUN);

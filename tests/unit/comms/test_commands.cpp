@@ -511,6 +511,27 @@ TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     EXPECT_TRUE(commands.failed);
 }
 
+TEST_F(Commands, bad_frames_among_enough_good_ones_never_add_up) {
+    arm(1, 10000);
+    uint8_t counter = 1;
+    uint32_t time_us = 10000;
+    for (int round = 0; round < 100; round++) {
+        for (int i = 0; i < 3; i++) {
+            hal_can_frame_t damaged = command_frame(99);
+            damaged.data[5] ^= 1;
+            take(damaged, DRIVE_STATE_RUN, time_us);
+        }
+        EXPECT_EQ(commands.errors, 3 * COMMANDS_ERROR_STEP);
+        for (unsigned i = 0; i < 3 * COMMANDS_ERROR_STEP; i++) {
+            time_us += 10000;
+            ASSERT_EQ(take(command_frame(++counter), DRIVE_STATE_RUN, time_us), COMMANDS_COMMAND);
+        }
+        ASSERT_EQ(commands.errors, 0) << round;
+    }
+    EXPECT_FALSE(commands.failed);
+    EXPECT_TRUE(commands.arming.armed);
+}
+
 TEST_F(Commands, a_valid_command_behind_the_last_bad_one_is_only_counted_until_the_run_has_ended) {
     arm(1, 10000);
     for (int i = 0; i < 4; i++) {

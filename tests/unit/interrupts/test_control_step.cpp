@@ -313,6 +313,20 @@ TEST_F(Control, clearing_a_fault_on_a_turning_rotor_causes_no_other) {
     }
 }
 
+TEST_F(Control, a_rotor_that_turns_at_once_while_ready_is_caught_within_5_ms_by_a_slow_observer) {
+    for (const double rpm : {2900.0, 4200.0}) {
+        configure_with(DRIVE_CONTROLLER_TRADITIONAL, PARAMETER_OBSERVER_BANDWIDTH_RAD_S, 200);
+        speed_rad_s = 0.0;
+        start();
+        speed_rad_s = fixed_point::rad_s(rpm);
+        for (int k = 0; k < 200; k++) {
+            step(COMMAND_OFF);
+        }
+        EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
+        EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    }
+}
+
 TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) {
     parameters.speed_ramp_q22 = fixed_point::to_fixed(0.01, fixed_point::Q22); // rad/s a period
     speed_rad_s = 20.0;

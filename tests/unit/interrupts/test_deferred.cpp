@@ -289,6 +289,23 @@ TEST_F(Deferred, a_run_begins_without_torque_and_integral_of_the_speed_law_also_
     EXPECT_EQ(results().speed.speed_law_torque_q24, 0);
 }
 
+TEST_F(Deferred, the_integral_of_the_pi_stays_at_a_torque_limit_below_its_own) {
+    configure(DRIVE_CONTROLLER_TRADITIONAL);
+    state.torque_limit_q24 = fixed_point::to_fixed(1.0, fixed_point::Q24); // as by heat
+    ASSERT_LT(state.torque_limit_q24, parameters.speed_pi.torque_max_q24 / 2);
+    start();
+    for (int k = 0; k < 4000; k++) {
+        period(COMMAND_RUN);
+    }
+    EXPECT_EQ(results().speed.speed_law_torque_q24, state.torque_limit_q24) << "of a rotor that does not turn";
+    EXPECT_EQ(state.deferred.speed_pi.integral_q54, int64_t(state.torque_limit_q24) << 30);
+    speed_rad_s = fixed_point::rad_s(700.0); // the load has gone, the speed is above the reference
+    for (int k = 0; k < 100; k++) {
+        period(COMMAND_RUN);
+    }
+    EXPECT_LT(results().speed.speed_law_torque_q24, state.torque_limit_q24 / 2);
+}
+
 TEST_F(Deferred, in_torque_mode_the_reference_is_the_command_without_load_and_friction) {
     for (const drive_controller_t controller :
          {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {

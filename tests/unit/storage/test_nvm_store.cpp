@@ -377,6 +377,22 @@ TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_agai
     EXPECT_EQ(drive.store.waiting_count, 2);
 }
 
+TEST_F(NvmStore, two_faults_that_wait_are_both_logged_in_their_order) {
+    for (const uint32_t number : {1u, 2u}) {
+        const fault_record_t record = fault_of(number);
+        nvm_store_follow_fault(&drive.store, &record);
+    }
+    for (uint32_t i = 0; i < 2 * FAULT_WORDS; i++) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, fault_of(2).time_us + i, true);
+    }
+    for (const uint32_t number : {1u, 2u}) {
+        nvm_store_fault_t logged;
+        ASSERT_TRUE(nvm_store_read_fault(&drive.store, &memory.hal, number, &logged)) << number;
+        EXPECT_EQ(logged.time_us, fault_of(number).time_us);
+        EXPECT_EQ(logged.speed_q22, fault_of(number).speed_q22);
+    }
+}
+
 TEST_F(NvmStore, the_time_of_a_fault_counts_the_wraps_of_the_clock) {
     nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 100, false);
     nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 10, false);

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.experiments.campaign import canaries, known, names
+from salient.experiments import planted
+from salient.experiments.campaign import known, names
 from salient.experiments.campaign.failure import Failure, classes, load, replay, save
 from salient.experiments.campaign.runner import ALL_EVENTS, Result, commit, digest, processor_s, serve, world
 from salient.experiments.tasks import Task, read_results, run
-from salient.paths import make_folder
+from salient.paths import BUILD, make_folder
 from salient.progress import Progress
 
 _SHOWN_MAX = 8
@@ -148,11 +149,11 @@ def run_replay(options: argparse.Namespace) -> int:
         folder = options.out / str(failure.seed)
     seed, kept, healthy = failure.seed, failure.kept, failure.healthy
     programs = None
-    if failure.canary is not None:
+    if failure.bug is not None:
         if options.build != "host":
             raise UsageError(f"--target {options.build}: {folder} has a planted bug, which the host alone can have")
-        programs = canaries.build(failure.canary)
-        print(f"with the planted bug {failure.canary}: {canaries.canaries()[failure.canary - 1].name}")
+        programs = planted.campaign_programs(planted.named(failure.bug), BUILD / "campaign" / "planted")
+        print(f"with the planted bug '{failure.bug}'")
     make_folder(folder)
     described = world(seed, kept, healthy)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "

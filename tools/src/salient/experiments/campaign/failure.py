@@ -157,14 +157,14 @@ def _hash(log: list[tuple[int, can.Message]]) -> int:
     return value
 
 
-def save(seed: int, violation: str, folder: Path, healthy: bool = False, canary: int | None = None,
+def save(seed: int, violation: str, folder: Path, healthy: bool = False, bug: str | None = None,
          programs: Programs | None = None) -> dict[str, Any]:
-    """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot. canary:
-    number of the planted bug that the programs have."""
+    """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot. bug: name
+    of the planted one that the programs have."""
     folder.mkdir(parents=True, exist_ok=True)
     kept = shrink(seed, violation, healthy, programs)
     again = replay(seed, kept, healthy, folder, programs=programs)
-    note = {"seed": seed, "healthy": healthy, "canary": canary, "kept": f"{kept:#x}", "violation": violation,
+    note = {"seed": seed, "healthy": healthy, "bug": bug, "kept": f"{kept:#x}", "violation": violation,
             "hash": again.hash, "equal": again.equal, "world": world(seed, kept, healthy), "result": again.campaign,
             "replay": f"tools/salient replay {folder}"}
     (folder / "failure.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
@@ -173,12 +173,12 @@ def save(seed: int, violation: str, folder: Path, healthy: bool = False, canary:
 
 @dataclass(frozen=True)
 class Failure:
-    """What a failure's folder asks to be run. canary: number of the planted bug that its programs had."""
+    """What a failure's folder asks to be run. bug: name of the planted one that its programs had."""
 
     seed: int
     kept: int
     healthy: bool
-    canary: int | None
+    bug: str | None
 
 
 def load(folder: Path) -> Failure:
@@ -186,9 +186,9 @@ def load(folder: Path) -> Failure:
     path = folder / "failure.json"
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
-        canary = note.get("canary")
+        bug = note.get("bug")
         return Failure(int(note["seed"]), int(note["kept"], 16), bool(note["healthy"]),
-                       None if canary is None else int(canary))
+                       None if bug is None else str(bug))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "
                          "campaign has left") from None

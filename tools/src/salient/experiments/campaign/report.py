@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from salient.experiments import fault_table
+from salient.experiments import fault_table, planted
 from salient.experiments.campaign import branching, same_bits
 from salient.paths import ROOT
 
@@ -89,17 +89,16 @@ def _branches() -> tuple[str, str, str]:
             + (f" ({listed})" if listed else ""), f"`{_MODULE}.branching DIR`")
 
 
-def _canaries() -> tuple[str, str, str]:
-    notes = _note("canaries.json")
-    found = [note for note in notes if "seed" in note]
-    seconds = sorted(note["processor_s"] for note in found)
+def _planted() -> tuple[str, str, str]:
+    note = json.loads(planted.SUMMARY.read_text(encoding="utf-8"))
+    of = note["campaign"]
+    least_s, middle_s, most_s = of["processor_s"]
     return ("planted bugs",
-            f"**{len(found)} of {len(notes)} found** at {_commits(notes)} in {seconds[0]:.1f} to {seconds[-1]:.1f} "
-            f"processor seconds each, {seconds[len(seconds) // 2]:.1f} in the middle; shrunk to at most "
-            f"{max(len(note['events']) for note in found)} events in at most "
-            f"{max(note['shrinking_s'] for note in found):.1f} processor seconds; "
-            f"{sum(note['replays'] for note in found)} replayed with equal bits, log and plots; each in "
-            "[canaries.json](../tests/campaign/canaries.json)", f"`{_MODULE}.canaries DIR`")
+            f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} processor "
+            f"seconds each, {middle_s:.1f} in the middle, by seeds from 1 to at most {of['last_seed']}; shrunk to at "
+            f"most {of['events']} events in at most {of['shrinking_s']:.1f} processor seconds; {of['replayed']} "
+            "replayed with equal bits, log and plots; those of the tests too in [planted.json](../tests/planted.json)",
+            "`build/venv/bin/python -m salient.experiments.planted`")
 
 
 def _cluster() -> tuple[str, str, str]:
@@ -121,7 +120,7 @@ def table() -> str:
     """Markdown."""
     rows = [_worlds("faults", "worlds with faults, in one go"),
             _worlds("shards", "worlds with faults, in ten shards, interrupted and resumed", " --shard I/10"),
-            _worlds("healthy", "healthy worlds"), _branches(), _canaries(), _cluster(), _bits()]
+            _worlds("healthy", "healthy worlds"), _branches(), _planted(), _cluster(), _bits()]
     return "".join(f"| {' | '.join(row)} |\n" for row in [("", "measured", "command"), ("---",) * 3, *rows])
 
 
@@ -132,39 +131,19 @@ def page() -> str:
 
 
 def plot(path: Path) -> None:
-    """Reaction times of the branches, and processor seconds until the planted bugs were found."""
+    """Reaction times of the branches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 10), layout="constrained")
+    figure = Figure(figsize=(9, 10), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1))
+    axes = figure.subplots()
     rows = branching.read(RESULTS / "branching")
-    branching.draw(left, rows)
+    branching.draw(axes, rows)
     of_all = branching.totals([row for lines in rows.values() for row in lines])
-    left.set_title(f"{of_all['branches']:,} branches, {of_all['violations']:,} with a violation\n"
-                   "salient, machine saturating, 40 kHz, sensors of 12 and 17 bits, phase a", fontsize="medium")
-    notes = [note for note in _note("canaries.json") if "seed" in note]
-    labels = [note["name"] for note in notes]
-    for name, what, marker in (("processor_s", "until found", "o"), ("shrinking_s", "to shrink it", "D")):
-        right.plot([note[name] for note in notes], range(len(labels)), marker, linestyle="none", label=what)
-    for index, note in enumerate(notes):
-        count = len(note["events"])
-        right.annotate(f"{count} event{'' if count == 1 else 's'}", (1.01, index), xycoords=("axes fraction", "data"),
-                       va="center", fontsize="small")
-    right.set_yticks(range(len(labels)), labels, fontsize="small")
-    right.set_ylim(len(labels) - 0.4, -0.6)
-    right.set_xscale("log")
-    right.set_xlim(0.005, 100)
-    right.set_xlabel("processor seconds")
-    right.grid(alpha=0.3, axis="x")
-    right.legend(loc="upper left", fontsize="small")
-    faults = _note("shards.json")
-    violations = sum(entry["count"] for entry in faults["violations"].values())
-    without = f"{faults['seeds']:,} seeds at {faults['commit']} without them: {violations} violations"
-    right.set_title(f"{len(notes)} of {len(_note('canaries.json'))} planted bugs found at {_commits(notes)}, by seeds "
-                    f"from 1 on\n{without}", fontsize="medium")
-    figure.suptitle("Campaigns by seed: an emulated drive, default parameters")
+    axes.set_title(f"{of_all['branches']:,} branches, {of_all['violations']:,} with a violation\n"
+                   "salient, machine saturating, 40 kHz, sensors of 12 and 17 bits, phase a, default parameters",
+                   fontsize="medium")
     figure.savefig(path, dpi=80)
 
 
