@@ -6,7 +6,7 @@
  *
  * Both switches off are the duty -1: full opposite voltage until the flux linkage has gone. A phase that is off once in
  * an electrical revolution begins at 0 each time. Drops of the devices and errors of R and Vdc accumulate; the caller
- * corrects the integral by what it knows of the flux linkage (monitors/phase_monitor.h). While there is current it may
+ * corrects the integral by what it knows of the flux linkage (flux_residual.h). While there is current it may
  * fall below 0: that is what the error of R is known by (table_scale.h). */
 #ifndef CONTROL_APPLIED_FLUX_H
 #define CONTROL_APPLIED_FLUX_H
@@ -36,7 +36,8 @@ static inline int32_t applied_flux_shortest_pulse_q29(int32_t period_flux_q29, u
     return fixed_multiply(period_flux_q29, (int32_t)part_q14, 14);
 }
 
-/* Part of the sensors' range that is no current: an error of twice that is a fault of a sensor (phase_monitor.h). */
+/* Part of the sensors' range that is no current: an error of twice that is a fault of a sensor
+ * (monitors/phase_evidence.h). */
 #define APPLIED_FLUX_NO_CURRENT 64u
 
 /* Resistance of a winding, of which the drive knows neither temperature nor tolerance: copper is 0.75 of its value at

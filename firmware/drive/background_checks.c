@@ -28,15 +28,14 @@ COLD static void read_stall_input(const control_state_t *control, stall_input_t 
 /* What the checks need of the last control period: its sample, the integrals of the voltage at it, the speed law. */
 typedef struct {
     stall_input_t stall;
-    phase_monitor_input_t phases;
+    flux_sample_t flux;
     uint32_t encoder_angle;
-    int32_t flux_q29[HAL_PHASES_MAX]; /* as in phases, but below 0 where the integral is */
 } sample_t;
 
 COLD static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
     const deferred_request_t *request = &control->deferred_request;
     const control_measurement_t *measured = &control->measurement;
-    phase_monitor_input_t *input = &sample->phases;
+    flux_sample_t *input = &sample->flux;
     for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
         input->periods = unmasked_read_begin(request);
         input->run = control->state_machine.state == DRIVE_STATE_RUN;
@@ -49,9 +48,8 @@ COLD static bool read_sample(const control_state_t *control, const control_param
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             input->misalignment[phase] = misalignment[phase];
             input->current_q9[phase] = measured->current_q9[phase];
-            sample->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
-            input->flux_q29[phase] = fixed_non_negative(sample->flux_q29[phase]);
-            input->next_q29[phase] = fixed_non_negative(control->applied_flux.next_q29[phase]);
+            input->flux_q29[phase] = control->applied_flux.at_sample_q29[phase];
+            input->next_q29[phase] = control->applied_flux.next_q29[phase];
             input->off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
         }
         read_stall_input(control, &sample->stall);
@@ -62,104 +60,39 @@ COLD static bool read_sample(const control_state_t *control, const control_param
     return false;
 }
 
-/* An integral that saturates, as that of a phase which holds a load for half a second at another resistance. */
-static bool saturated(int32_t flux_q29) {
-    return fixed_magnitude(flux_q29) >= INT32_MAX;
-}
-
-/* Of the sample of `input`; the integrals without the corrections that the other monitor has made. */
-COLD static encoder_monitor_input_t encoder_input(const phase_monitor_input_t *input, const phase_monitor_t *phases,
-                                                  uint32_t encoder_angle, const stall_input_t *motion) {
-    encoder_monitor_input_t encoder = {
-        .run = input->run,
-        .encoder_angle = encoder_angle,
-        .speed_q22 = motion->speed_q22,
-        .torque_q24 = motion->torque_reference_q24,
-        .flux_step_max_q29 = input->period_flux_q29,
-        .period = input->periods,
-        .lost = input->late_interrupts != phases->late_interrupts,
-        .lost_phases = phases->lost,
-    };
-    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-        const phase_monitor_phase_t *state = &phases->phase[phase];
-        encoder.current_q9[phase] = input->current_q9[phase];
-        encoder.flux_q29[phase] = fixed_subtract(input->flux_q29[phase], state->followed_q29);
-        encoder.drop_q29[phase] = phase_monitor_drop_q29(phases, input, phase);
-        encoder.zero_at[phase] = state->zero_at;
-        encoder.known[phase] = input->periods - state->zero_at < input->periods - phases->lost_at &&
-                               !saturated(state->followed_q29) && !saturated(encoder.flux_q29[phase]);
-    }
-    return encoder;
-}
-
-/* Of the same sample: phases that conduct above the currents whose errors are those of the converter, for so short a
- * time that a warm winding and the error of the voltage are less than half of the flux linkage. */
-static phase_balance_sample_t balance_sample(const drive_t *drive, const phase_monitor_input_t *input,
-                                             const encoder_monitor_input_t *encoder, uint32_t elapsed, uint32_t step) {
-    const uint32_t recent = 10u * drive->control_parameters.initialise_ticks;
-    const bool learned = drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE;
-    phase_balance_sample_t sample = {
-        .run = encoder->run,
-        .phases = machine_tables.phases,
-        .lost = encoder->lost_phases,
-        .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
-        .elapsed = elapsed,
-        .periods_per_ms = drive->control_parameters.initialise_ticks,
-        .step = step,
-    };
-    const int32_t voltage_q29 =
-        applied_flux_voltage_error_q29(&machine_tables, input->period_flux_q29, input->period_q40);
-    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        const uint32_t since_zero = encoder->period - encoder->zero_at[phase];
-        const int32_t age = (int32_t)(since_zero < recent ? since_zero : recent);
-        const int32_t current_q9 = encoder->current_q9[phase];
-        const int32_t drop_q29 = encoder->drop_q29[phase];
-        const int64_t error_q29 = applied_flux_warm_q29(&machine_tables, drop_q29) + fixed_product(voltage_q29, age);
-        const int32_t table_q29 = drive->phases.phase[phase].table_q29;
-        sample.flux_q29[phase] = encoder->flux_q29[phase];
-        sample.cold_q29[phase] = applied_flux_cold_q29(drop_q29);
-        sample.table_q29[phase] = table_q29;
-        sample.known[phase] = encoder->known[phase] && since_zero < recent && error_q29 < table_q29 / 2 &&
-                              current_q9 > machine_tables.current_range_q9 / 32;
-    }
-    return sample;
-}
-
 /* 0.5 rad/s: at a lower speed the errors of the voltage are many times the flux linkage. */
 #define FLUX_ANGLE_SPEED_MIN_Q22 (1u << 21)
 
 /* Misalignment of the phases by their flux linkage. */
-static void follow_misalignment(drive_t *drive, const phase_monitor_input_t *input,
-                                const encoder_monitor_input_t *encoder, uint32_t elapsed) {
-    const bool turns = fixed_magnitude(encoder->speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
+static void follow_misalignment(drive_t *drive, int32_t speed_q22) {
+    const flux_residual_t *residual = &drive->flux.residual;
+    const bool turns = fixed_magnitude(speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
     const int32_t periods =
-        (int32_t)(elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
-    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        flux_angle_t *flux_angle = &drive->flux_angle[phase];
-        const int32_t current_q9 = input->current_q9[phase];
-        const int32_t misalignment = input->misalignment[phase];
+        (int32_t)(residual->elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
+    for (unsigned index = 0; index < machine_tables.phases; index++) {
+        flux_angle_t *flux_angle = &drive->flux_angle[index];
+        const flux_residual_phase_t *phase = &residual->phase[index];
         const flux_angle_sample_t sample = {
-            .angle = input->electrical - phase * input->stroke - (uint32_t)misalignment,
-            .misalignment = misalignment,
-            .current_q9 = current_q9,
-            .flux_q29 = encoder->flux_q29[phase],
-            .table_q29 = drive->phases.phase[phase].table_q29,
-            .resistive_q29 = fixed_multiply_high(current_q9 << 12, input->resistance_period_q40) * periods,
-            .time_q29 = (input->period_flux_q29 >> 8) * periods,
-            .counts = turns && encoder->known[phase] && !input->off[phase] &&
-                      current_q9 > machine_tables.current_range_q9 / 64,
+            .angle = phase->angle,
+            .misalignment = phase->misalignment,
+            .current_q9 = phase->current_q9,
+            .flux_q29 = phase->voltage_q29,
+            .table_q29 = phase->table_q29,
+            .resistive_q29 = phase->step_drop_q29,
+            .time_q29 = (residual->period_flux_q29 >> 8) * periods,
+            .counts = turns && phase->known && !phase->off && phase->current_q9 > machine_tables.current_range_q9 / 64,
         };
-        if (!input->run) {
+        if (!residual->run) {
             *flux_angle = (flux_angle_t){0};
-            drive->control.flux_misalignment[phase] = 0;
+            drive->control.flux_misalignment[index] = 0;
         } else if (flux_angle_add(flux_angle, &machine_tables, &sample)) {
-            drive->control.flux_misalignment[phase] = flux_angle_solve(flux_angle);
+            drive->control.flux_misalignment[index] = flux_angle_solve(flux_angle);
         }
     }
 }
 
 /* Threshold of the integral of the voltage. */
-static bool no_current(const phase_monitor_input_t *input, unsigned phase) {
+static bool no_current(const flux_sample_t *input, unsigned phase) {
     return input->current_q9[phase] <= (int32_t)(machine_tables.current_range_q9 / APPLIED_FLUX_NO_CURRENT);
 }
 
@@ -189,27 +122,27 @@ static int32_t factor_by_shaft_q30(drive_t *drive) {
                                                                           : TABLE_SCALE_ONE_Q30;
 }
 
-/* Scale of the tables. After the check of the phases, whose corrections are in the integrals of the next sample. */
-static void follow_table_scale(drive_t *drive, const sample_t *sampled, const int32_t correction_q29[HAL_PHASES_MAX],
-                               uint32_t elapsed, bool lost) {
+/* Scale of the tables. After the corrections, which are in the integrals of the next sample. */
+static void follow_table_scale(drive_t *drive, const flux_sample_t *input,
+                               const int32_t correction_q29[HAL_PHASES_MAX]) {
     const control_parameters_t *parameters = &drive->control_parameters;
-    const phase_monitor_input_t *input = &sampled->phases;
+    const flux_residual_t *residual = &drive->flux.residual;
     const int32_t period_q40 = parameters->predictive.period_q40;
-    const int32_t periods = (int32_t)(elapsed & 0xffu);
+    const int32_t periods = (int32_t)(residual->elapsed & 0xffu);
     const int32_t removable_q29 = 2 * (int32_t)(parameters->initialise_ticks / CHECKS_PER_MS) * input->period_flux_q29;
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
-        const phase_monitor_phase_t *state = &drive->phases.phase[phase];
+        const flux_residual_phase_t *state = &residual->phase[phase];
         drive->conduction_ends |= input->off[phase] && !no_current(input, phase) && state->table_q29 < removable_q29;
         const table_scale_sample_t sample = {
             .current_q9 = input->current_q9[phase],
-            .flux_q29 = sampled->flux_q29[phase],
+            .flux_q29 = input->flux_q29[phase],
             .correction_q29 = correction_q29[phase],
             .table_q29 = state->table_q29,
             .periods = (uint32_t)periods,
             .drop_q29 = applied_flux_period_q29(machine_tables.device_drop_q6, period_q40) * periods,
             .zero = state->zero_at == input->periods && no_current(input, phase),
             .none = no_current(input, phase),
-            .lost = lost,
+            .lost = residual->lost,
         };
         table_scale_add(&drive->table_scale, phase, &sample, machine_tables.current_range_q9 / 32);
     }
@@ -229,29 +162,22 @@ static void follow_table_scale(drive_t *drive, const sample_t *sampled, const in
 }
 
 /* Checks phases and encoder, and corrects the integrals. */
-COLD static uint32_t check_phases_and_encoder(drive_t *drive, const sample_t *sample) {
-    const phase_monitor_input_t *input = &sample->phases;
-    const encoder_monitor_input_t encoder = encoder_input(input, &drive->phases, sample->encoder_angle, &sample->stall);
-    encoder_monitor_step(&drive->control_parameters.encoder_monitor, &drive->encoder, &encoder);
-    int32_t correction_q29[HAL_PHASES_MAX];
-    const uint32_t elapsed = input->periods - drive->phases.periods;
-    const uint32_t step = (uint32_t)fixed_abs((int32_t)(input->electrical - drive->phases.electrical));
-    uint32_t failed = phase_monitor_step(&drive->phases, &machine_tables, input, correction_q29);
-    const phase_balance_sample_t balance = balance_sample(drive, input, &encoder, elapsed, step);
-    failed |= phase_balance_step(&drive->balance, &balance);
-    drive->phases.phases |= drive->balance.phases;
+COLD static uint32_t check_flux(drive_t *drive, const sample_t *sample) {
+    const flux_sample_t *input = &sample->flux;
+    const flux_monitor_motion_t motion = {
+        .encoder_angle = sample->encoder_angle,
+        .speed_q22 = sample->stall.speed_q22,
+        .torque_q24 = sample->stall.torque_reference_q24,
+    };
+    const uint32_t failed = flux_monitor_step(&drive->control_parameters.flux_monitor, &drive->flux, input, &motion);
     if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
-        follow_misalignment(drive, input, &encoder, elapsed);
+        follow_misalignment(drive, motion.speed_q22);
     }
+    int32_t correction_q29[HAL_PHASES_MAX];
+    flux_residual_follow(&drive->flux.residual, input, correction_q29);
     drive->conduction_ends = false;
     if (input->run) {
-        follow_table_scale(drive, sample, correction_q29, elapsed, encoder.lost);
-    }
-    const uint32_t of_phases =
-        (uint32_t)(FAULT_BIT(FAULT_PHASE_OPEN) | FAULT_BIT(FAULT_PHASE_SHORTED) | FAULT_BIT(FAULT_CURRENT_SENSOR));
-    if ((failed & of_phases) != 0 &&
-        encoder_monitor_suspects(&drive->control_parameters.encoder_monitor, &drive->encoder, drive->phases.phases)) {
-        failed = (failed & ~of_phases) | (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
+        follow_table_scale(drive, input, correction_q29);
     }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
@@ -294,30 +220,20 @@ COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     hal_critical_leave(drive->hal);
 }
 
-/* Of the only bit of a mask, from 1 on. */
-COLD static uint32_t number_of(uint32_t mask) {
-    uint32_t number = 0;
-    for (; mask != 0; mask >>= 1) {
-        number++;
-    }
-    return number;
-}
-
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
  * outside a run, or the parameter no longer allows it, which changes there only. */
 COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
-    if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->phases.phases)) {
-        drive->control.lost_phase = number_of(drive->degraded.lost);
-        phase_monitor_lose(&drive->phases, drive->degraded.lost);
-        drive->balance = (phase_balance_t){0};
+    if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->flux.phases)) {
+        drive->control.lost_phase = (uint32_t)__builtin_ctz(drive->degraded.lost) + 1u;
+        flux_monitor_lose(&drive->flux, drive->degraded.lost);
         failed = 0;
     } else if (!run && drive->degraded.lost != 0 &&
                (drive->command.request == COMMAND_CLEAR_FAULT || !parameters->allowed)) {
         drive->degraded.lost = 0;
         drive->control.lost_phase = 0;
-        phase_monitor_lose(&drive->phases, 0);
+        flux_monitor_lose(&drive->flux, 0);
     }
     degraded_step(parameters, &drive->degraded, &machine_tables);
     return failed;
@@ -326,27 +242,21 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
 /* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
 COLD static void check(drive_t *drive, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
-    sample_t sample = {.phases = {.periods_per_ms = parameters->initialise_ticks,
-                                  .stroke = parameters->commutation.stroke,
-                                  .period_q40 = parameters->predictive.period_q40,
-                                  .resistance_period_q40 = parameters->predictive.flux.resistance_period_q40}};
+    sample_t sample = {.flux = {.periods_per_ms = parameters->initialise_ticks,
+                                .stroke = parameters->commutation.stroke,
+                                .period_q40 = parameters->predictive.period_q40,
+                                .resistance_period_q40 = parameters->predictive.flux.resistance_period_q40}};
     if (!read_sample(&drive->control, parameters, &sample)) {
         return;
     }
-    uint32_t failed = follow_lost_phase(drive, check_phases_and_encoder(drive, &sample));
+    uint32_t failed = follow_lost_phase(drive, check_flux(drive, &sample));
     if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
     }
     if (sto_monitor_failed(&drive->sto, drive->break_causes, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STO_DISCREPANCY);
     }
-    if (drive->encoder.frozen) {
-        failed |= (uint32_t)FAULT_BIT(FAULT_ENCODER);
-    }
-    if (drive->encoder.angle) {
-        failed |= (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
-    }
-    if (drive->encoder.over_speed) {
+    if (drive->flux.encoder.over_speed) {
         failed |= (uint32_t)FAULT_BIT(FAULT_OVER_SPEED);
     }
     drive->failed_checks = failed;
@@ -355,9 +265,9 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
 COLD void background_checks(drive_t *drive, uint32_t time_us) {
     follow_heat(drive, time_us);
     test_itself(drive, time_us);
-    const bool suspicious = drive->phases.suspicious || drive->encoder.suspicious || drive->conduction_ends;
+    const bool suspicious = drive->flux.evidence.suspicious || drive->conduction_ends;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
-    if (unmasked_read_periods(&drive->control.deferred_request) - drive->phases.periods >= spacing) {
+    if (unmasked_read_periods(&drive->control.deferred_request) - drive->flux.residual.periods >= spacing) {
         check(drive, time_us);
     }
     uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal) | temperature_faults(&drive->temperature) |

@@ -14,9 +14,7 @@
 #include "interrupts/control_step.h"
 #include "interrupts/fault_trace.h"
 #include "interrupts/self_test.h"
-#include "monitors/encoder_monitor.h"
-#include "monitors/phase_balance.h"
-#include "monitors/phase_monitor.h"
+#include "monitors/flux_monitor.h"
 #include "monitors/stall_monitor.h"
 #include "monitors/sto_monitor.h"
 #include "monitors/temperature.h"
@@ -58,14 +56,12 @@ typedef struct {
     uint32_t failed_checks;    /* of phases, encoder, stall and STO lines, when last checked, FAULT_BITs */
     sto_monitor_t sto;
     stall_monitor_t stall;
-    phase_monitor_t phases;
-    phase_balance_t balance;
+    flux_monitor_t flux;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
     bool conduction_ends; /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
     shaft_torque_t shaft_torque;
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
-    encoder_monitor_t encoder;
     thermal_t thermal;
     temperature_t temperature;
     self_test_t self_test;

@@ -160,8 +160,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->deferred.worst_us = processor_time(drive, drive->deferred_worst_ticks);
     telemetry->deferred.skipped_periods = control->deferred_request.skipped_total;
 
-    telemetry->gates = drive->break_causes;        /* the DBC has the bits of HAL_PWM_BREAK_* */
-    telemetry->phase_fault = drive->phases.phases; /* the DBC has a bit for each phase */
+    telemetry->gates = drive->break_causes;      /* the DBC has the bits of HAL_PWM_BREAK_* */
+    telemetry->phase_fault = drive->flux.phases; /* the DBC has a bit for each phase */
     telemetry->thermal.winding_load = percent(thermal_winding_load_q16(&drive->thermal));
     telemetry->thermal.switch_load = percent(thermal_switch_load_q16(&drive->thermal));
     telemetry->thermal.torque_limit_nm = units_torque_q8(control->torque_limit_q24);

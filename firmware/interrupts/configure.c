@@ -121,31 +121,38 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
 /* 2^-32 rev. */
 #define DEGREE UINT32_C(11930465)
 
-static encoder_monitor_parameters_t encoder_monitor_from(const control_parameters_t *control, const int32_t *values,
-                                                         uint32_t control_rate_hz) {
+static flux_monitor_parameters_t flux_monitor_from(const control_parameters_t *control, const int32_t *values,
+                                                   uint32_t control_rate_hz) {
     const uint32_t rotor_poles = control->commutation.rotor_poles;
-    const uint32_t angle_deg =
-        control->torque_law == TORQUE_LAW_PREDICTIVE ? ENCODER_MONITOR_LEARNED_DEG : ENCODER_MONITOR_ANGLE_DEG;
+    const bool learned = control->torque_law == TORQUE_LAW_PREDICTIVE;
+    const uint32_t angle_deg = learned ? ANGLE_EVIDENCE_LEARNED_DEG : ANGLE_EVIDENCE_DEG;
     const int32_t over_speed_q22 = fixed_saturate(speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM]));
     const int32_t travel = fixed_multiply_high(over_speed_q22, control->observer.angle_step_q32);
-    return (encoder_monitor_parameters_t){
-        .commutation = control->commutation,
-        .half_count = control->encoder_middle * rotor_poles,
-        .middle = control->encoder_middle,
-        .advance_min = (int32_t)(control->commutation.stroke / rotor_poles / ENCODER_MONITOR_ADVANCE_STROKES +
-                                 ENCODER_MONITOR_ADVANCE_COUNTS * 2u * control->encoder_middle),
-        .angle_max = DEGREE * angle_deg * rotor_poles,
-        .flux_error_q29 = encoder_monitor_flux_error_q29(
-            load_observer_acceleration(values[PARAMETER_TORQUE_MAX_NM], values[PARAMETER_INERTIA_KG_M2]),
-            values[PARAMETER_CURRENT_LIMIT_A] / 2, control->observer.angle_step_q32, rotor_poles),
-        .resistance_period_q40 = control->predictive.flux.resistance_period_q40,
-        .period_q40 = control->predictive.period_q40,
-        .rate_hz = control_rate_hz,
-        .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
-        .over_speed_q22 = over_speed_q22,
-        .travel = travel,
-        .travel_change =
-            fixed_multiply_high(control->protection.deceleration_max_q22, control->observer.angle_step_q32),
+    return (flux_monitor_parameters_t){
+        .angle =
+            {
+                .commutation = control->commutation,
+                .half_count = control->encoder_middle * rotor_poles,
+                .middle = control->encoder_middle,
+                .advance_min = (int32_t)(control->commutation.stroke / rotor_poles / ANGLE_EVIDENCE_ADVANCE_STROKES +
+                                         ANGLE_EVIDENCE_ADVANCE_COUNTS * 2u * control->encoder_middle),
+                .angle_max = DEGREE * angle_deg * rotor_poles,
+                .flux_error_q29 = angle_evidence_flux_error_q29(
+                    load_observer_acceleration(values[PARAMETER_TORQUE_MAX_NM], values[PARAMETER_INERTIA_KG_M2]),
+                    values[PARAMETER_CURRENT_LIMIT_A] / 2, control->observer.angle_step_q32, rotor_poles),
+                .rate_hz = control_rate_hz,
+                .current_min_q9 = values[PARAMETER_CURRENT_LIMIT_A] / 8,
+            },
+        .encoder =
+            {
+                .middle = control->encoder_middle,
+                .rate_hz = control_rate_hz,
+                .over_speed_q22 = over_speed_q22,
+                .travel = travel,
+                .travel_change =
+                    fixed_multiply_high(control->protection.deceleration_max_q22, control->observer.angle_step_q32),
+            },
+        .least_q8 = learned ? PHASE_BALANCE_LEAST_LEARNED_Q8 : PHASE_BALANCE_LEAST_Q8,
     };
 }
 
@@ -539,7 +546,7 @@ static void set_monitors(control_parameters_t *control, const source_t *from) {
     control->protection =
         protection_from(from->values, control->observer.angle_step_q32, control->encoder_shift, from->control_rate_hz);
     control->degraded = degraded_from(control, from->values);
-    control->encoder_monitor = encoder_monitor_from(control, from->values, from->control_rate_hz);
+    control->flux_monitor = flux_monitor_from(control, from->values, from->control_rate_hz);
 }
 
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,

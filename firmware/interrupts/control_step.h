@@ -45,7 +45,7 @@
 #include "interrupts/deferred_exchange.h"
 #include "interrupts/state_machine.h"
 #include "monitors/degraded.h"
-#include "monitors/encoder_monitor.h"
+#include "monitors/flux_monitor.h"
 #include "monitors/protection.h"
 #include "monitors/temperature.h"
 #include "monitors/thermal.h"
@@ -101,7 +101,7 @@ typedef struct {
     inertia_parameters_t inertia;
     slow_counts_parameters_t slow_counts;
     count_course_parameters_t count_course;
-    encoder_monitor_parameters_t encoder_monitor; /* this and the next four: background */
+    flux_monitor_parameters_t flux_monitor; /* this and the next four: background */
     int32_t table_scale_part_q31; /* by which the scale of the tables follows in a period, Q0.31; 0: it is 1 */
     bool scale_by_shaft;          /* and by the acceleration of the shaft, shaft_torque.h */
     degraded_parameters_t degraded;

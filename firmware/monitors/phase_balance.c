@@ -1,14 +1,16 @@
 #include "monitors/phase_balance.h"
 
+#include "control/applied_flux.h"
+#include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
-#include "storage/fault.h"
+#include "fixed/fixed.h"
 
 #define REVOLUTIONS 8u
 #define SLOWEST_MS 100u
 
-/* Windows in succession in which the encoder is ahead. */
-#define AHEAD_WINDOWS 2u
+/* Windows in succession in which all ratios are small. */
+#define SMALL_WINDOWS 2u
 
 /* Part of a window for which a phase has to conduct: 1/10. */
 #define CONDUCTING_PART 10u
@@ -16,15 +18,33 @@
 /* Phases of which one that differs from all others is the wrong one. */
 #define COMPARED_MIN 3u
 
-static void add(phase_balance_t *balance, const phase_balance_sample_t *sample) {
-    for (unsigned index = 0; index < sample->phases; index++) {
-        phase_balance_phase_t *phase = &balance->phase[index];
-        if (sample->known[index]) {
-            const int32_t flux_q29 = sample->flux_q29[index];
-            phase->flux_sum_q21 += (uint64_t)((flux_q29 > 0 ? flux_q29 : 0) >> 8) * sample->elapsed;
-            phase->cold_sum_q21 += (uint64_t)(sample->cold_q29[index] >> 8) * sample->elapsed;
-            phase->table_sum_q21 += (uint64_t)(sample->table_q29[index] >> 8) * sample->elapsed;
-            phase->conducting += sample->elapsed;
+/* Time without a zero of the current after which drift may be most of the integral, ms. */
+#define RECENT_MS 10u
+
+/* True of a phase that conducts above the currents whose errors are those of the converter, for so short a time that a
+ * warm winding and the error of the voltage are less than half of the flux linkage. */
+static bool counts(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
+    const uint32_t recent = RECENT_MS * residual->periods_per_ms;
+    const uint32_t age = residual->periods - phase->zero_at;
+    if (!phase->known || age >= recent || phase->current_q9 <= machine_tables.current_range_q9 / 32) {
+        return false;
+    }
+    const int32_t part_q29 = residual->period_flux_q29 / 64;
+    const int32_t voltage_q29 = residual->device_q29 > part_q29 ? residual->device_q29 : part_q29;
+    const int64_t warm_q29 = applied_flux_warm_q29(&machine_tables, phase->drop_q29);
+    return warm_q29 + fixed_product(voltage_q29, (int32_t)age) < phase->table_q29 / 2;
+}
+
+static void add(phase_balance_t *balance, const flux_residual_t *residual) {
+    for (unsigned index = 0; index < residual->phases; index++) {
+        const flux_residual_phase_t *phase = &residual->phase[index];
+        phase_balance_phase_t *sums = &balance->phase[index];
+        if (counts(residual, phase)) {
+            const int32_t cold_q29 = applied_flux_cold_q29(phase->drop_q29);
+            sums->flux_sum_q21 += (uint64_t)(fixed_non_negative(phase->voltage_q29) >> 8) * residual->elapsed;
+            sums->cold_sum_q21 += (uint64_t)(cold_q29 >> 8) * residual->elapsed;
+            sums->table_sum_q21 += (uint64_t)(phase->table_q29 >> 8) * residual->elapsed;
+            sums->conducting += residual->elapsed;
         }
     }
 }
@@ -63,45 +83,42 @@ static bool differs(const uint32_t *ratios_q8, unsigned phases, unsigned index) 
 }
 
 /* At the end of a window. */
-static void judge(phase_balance_t *balance, const phase_balance_sample_t *sample) {
-    const unsigned phases = sample->phases;
+static void judge(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8, uint32_t lost_phases) {
+    const unsigned phases = residual->phases;
     uint32_t ratios_q8[HAL_PHASES_MAX] = {0};
-    uint32_t judged = sample->lost;
-    bool ahead = true;
+    uint32_t judged = lost_phases;
+    bool small = true;
     for (unsigned index = 0; index < phases; index++) {
         ratios_q8[index] = ratio_q8(balance, index, false);
         judged |= (uint32_t)(ratios_q8[index] > 0) << index;
-        ahead &= ratio_q8(balance, index, true) < sample->least_q8;
+        small &= ratio_q8(balance, index, true) < least_q8;
     }
     const bool all = judged == (1u << phases) - 1u;
-    const bool comparable = all && phases - (sample->lost != 0) >= COMPARED_MIN;
-    uint32_t failed = 0;
+    const bool comparable = all && phases - (lost_phases != 0) >= COMPARED_MIN;
+    uint32_t unbalanced = 0;
     for (unsigned index = 0; index < phases; index++) {
-        failed |= (uint32_t)(comparable && differs(ratios_q8, phases, index)) << index;
+        unbalanced |= (uint32_t)(comparable && differs(ratios_q8, phases, index)) << index;
     }
-    balance->ahead_windows = all && ahead ? balance->ahead_windows + 1u : 0;
-    balance->phases |= failed;
-    if (failed != 0) {
-        balance->fault_mask |= (uint32_t)FAULT_BIT(FAULT_CURRENT_SENSOR);
-    } else if (balance->ahead_windows >= AHEAD_WINDOWS) {
-        balance->fault_mask |= (uint32_t)FAULT_BIT(FAULT_ENCODER_ANGLE);
-    }
+    balance->small_windows = all && small ? balance->small_windows + 1u : 0;
+    balance->unbalanced |= unbalanced;
+    balance->all_small |= unbalanced == 0 && balance->small_windows >= SMALL_WINDOWS;
 }
 
-COLD uint32_t phase_balance_step(phase_balance_t *balance, const phase_balance_sample_t *sample) {
-    if (!sample->run) {
+COLD void phase_balance_step(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8,
+                             uint32_t lost_phases, flux_evidence_t *evidence) {
+    if (!residual->run) {
         *balance = (phase_balance_t){0};
-        return 0;
+        return;
     }
-    add(balance, sample);
-    balance->periods += sample->elapsed;
-    balance->turned += sample->step;
-    if (balance->turned >> 32 < REVOLUTIONS) {
-        return balance->fault_mask;
+    add(balance, residual);
+    balance->periods += residual->elapsed;
+    balance->turned += (uint32_t)fixed_abs(residual->step);
+    if (balance->turned >> 32 >= REVOLUTIONS) {
+        if (balance->periods < REVOLUTIONS * SLOWEST_MS * residual->periods_per_ms) {
+            judge(balance, residual, least_q8, lost_phases);
+        }
+        begin(balance);
     }
-    if (balance->periods < REVOLUTIONS * SLOWEST_MS * sample->periods_per_ms) {
-        judge(balance, sample);
-    }
-    begin(balance);
-    return balance->fault_mask;
+    evidence->unbalanced = balance->unbalanced;
+    evidence->all_small = balance->all_small;
 }

@@ -255,25 +255,14 @@ bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, 
     return false;
 }
 
-uint32_t phase_monitor_step(phase_monitor_t *monitor, const machine_tables_t *tables,
-                            const phase_monitor_input_t *input, int32_t correction_q29[HAL_PHASES_MAX]) {
-    (void)monitor, (void)tables, (void)input;
-    memset(correction_q29, 0, HAL_PHASES_MAX * sizeof *correction_q29);
+uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
+                           const flux_sample_t *sample, const flux_monitor_motion_t *motion) {
+    (void)parameters, (void)monitor, (void)sample, (void)motion;
     return 0;
 }
 
-void phase_monitor_lose(phase_monitor_t *monitor, uint32_t phases) {
+void flux_monitor_lose(flux_monitor_t *monitor, uint32_t phases) {
     (void)monitor, (void)phases;
-}
-
-int32_t phase_monitor_drop_q29(const phase_monitor_t *monitor, const phase_monitor_input_t *input, unsigned phase) {
-    (void)monitor, (void)input, (void)phase;
-    return 0;
-}
-
-uint32_t phase_balance_step(phase_balance_t *balance, const phase_balance_sample_t *sample) {
-    (void)balance, (void)sample;
-    return 0;
 }
 
 bool degraded_accepts(const degraded_parameters_t *parameters, degraded_t *degraded, bool run, uint64_t failed,

@@ -66,7 +66,7 @@ void expect_currents_below_trip(const control_parameters_t &c, const parameters_
         }
     };
     ASSERT_EQ(c.hysteresis.current_limit_q9, std::min(c.hysteresis.generating_limit_q9, limit_q9));
-    const double slope_A = double(trip_q9 - c.hysteresis.generating_limit_q9) / c.encoder_monitor.over_speed_q22;
+    const double slope_A = double(trip_q9 - c.hysteresis.generating_limit_q9) / c.flux_monitor.encoder.over_speed_q22;
     ASSERT_NEAR(c.hysteresis.generating_slope_q19, held(slope_A * fixed_point::Q32), 1.0) << "two periods more";
     if (c.hysteresis.current_limit_q9 < limit_q9) {
         ASSERT_NO_FATAL_FAILURE(expect_highest(c.hysteresis.current_limit_q9, 2.2));
@@ -167,7 +167,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("trip", c.protection.current_trip_q9, v(PARAMETER_CURRENT_TRIP_A) * fixed_point::Q9, 0.0);
     near("over-voltage", c.protection.dc_link_over_voltage_q6, v(PARAMETER_BUS_OVER_VOLTAGE_V) * 64.0, 0.0);
     near("under-voltage", c.protection.dc_link_under_voltage_q6, v(PARAMETER_BUS_UNDER_VOLTAGE_V) * 64.0, 0.0);
-    near("over-speed", c.encoder_monitor.over_speed_q22,
+    near("over-speed", c.flux_monitor.encoder.over_speed_q22,
          fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) * fixed_point::Q22, 0.6);
     near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
     ASSERT_LE(std::fabs(c.protection.angle_step_max - (1.5 * fastest + 2.0 * count)), 3.0 + 1e-6 * fastest);
@@ -178,9 +178,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          2.0);
     const double slew = v(PARAMETER_TORQUE_SLEW_RATE_NM_S) / rate_hz * fixed_point::Q24;
     near("torque slew", c.torque_mode.slew_q24, slew == 0.0 ? INT32_MAX : std::max(slew, 1.0), 1.0);
-    near("fold-back", c.torque_mode.speed_end_q22, c.encoder_monitor.over_speed_q22 * 15.0 / 16.0, 1.0);
+    near("fold-back", c.torque_mode.speed_end_q22, c.flux_monitor.encoder.over_speed_q22 * 15.0 / 16.0, 1.0);
     near("speed range", c.speed_reference_max_q22,
-         std::min<double>(machine_tables.speed_max_q22, c.encoder_monitor.over_speed_q22 * 7.0 / 8.0 + 2.0), 2.0);
+         std::min<double>(machine_tables.speed_max_q22, c.flux_monitor.encoder.over_speed_q22 * 7.0 / 8.0 + 2.0), 2.0);
     near("timeout", c.protection.command_timeout_us, 500000.0, 0.0);
 
     const auto &share = c.conduction.sharing;

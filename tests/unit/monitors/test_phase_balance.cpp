@@ -5,7 +5,7 @@
 #include <gtest/gtest.h>
 
 extern "C" {
-#include "monitors/phase_balance.h"
+#include "monitors/flux_monitor.h"
 #include "storage/fault.h"
 }
 
@@ -17,31 +17,38 @@ constexpr uint32_t PERIODS_PER_REVOLUTION = 1000; // 25 ms at 40 kHz
 class PhaseBalance : public testing::Test {
   protected:
     void SetUp() override {
-        sample.run = true;
-        sample.phases = 3;
-        sample.least_q8 = PHASE_BALANCE_LEAST_Q8;
-        sample.elapsed = 1;
-        sample.periods_per_ms = 40;
+        residual.run = true;
+        residual.phases = 3;
+        residual.elapsed = 1;
+        residual.periods_per_ms = 40;
+    }
+
+    uint32_t verdict(const flux_evidence_t &evidence) const {
+        return uint32_t(FAULT_BIT(flux_monitor_verdict(&evidence, balance.unbalanced))) & ~1u;
     }
 
     // Eight electrical revolutions in each of which the phases conduct for a third, one after another.
     uint32_t window(uint32_t periods = PERIODS_PER_REVOLUTION) {
-        sample.step = uint32_t((uint64_t(1) << 32) / periods) + 1;
-        uint32_t failed = 0;
+        residual.step = int32_t((int64_t(1) << 32) / periods) + 1;
+        flux_evidence_t evidence{};
         for (uint32_t k = 0; k < 8 * periods; k++) {
-            for (unsigned phase = 0; phase < sample.phases; phase++) {
-                const bool conducts = k % periods * sample.phases / periods == phase && phase != silent;
-                sample.known[phase] = conducts && (phase != brief || k % periods % 16 == 0);
-                sample.table_q29[phase] = TABLE_Q29;
-                sample.flux_q29[phase] = int32_t(TABLE_Q29 * ratio[phase]);
+            for (unsigned phase = 0; phase < residual.phases; phase++) {
+                const bool conducts = k % periods * residual.phases / periods == phase && phase != silent;
+                flux_residual_phase_t &one = residual.phase[phase];
+                one.known = conducts && (phase != brief || k % periods % 16 == 0);
+                one.current_q9 = 20 * 512;
+                one.table_q29 = TABLE_Q29;
+                one.voltage_q29 = int32_t(TABLE_Q29 * ratio[phase]);
             }
-            failed = phase_balance_step(&balance, &sample);
+            evidence = {};
+            phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, lost, &evidence);
         }
-        return failed;
+        return verdict(evidence);
     }
 
     phase_balance_t balance{};
-    phase_balance_sample_t sample{};
+    flux_residual_t residual{};
+    uint32_t lost = 0;
     unsigned silent = HAL_PHASES_MAX; // phase without current
     unsigned brief = HAL_PHASES_MAX;  // phase that conducts for a sixteenth of its third
     double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
@@ -51,7 +58,7 @@ TEST_F(PhaseBalance, a_phase_beyond_four_thirds_or_three_quarters_of_all_others_
     for (const double wrong : {1.36, 0.73}) {
         ratio[1] = wrong;
         EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR)) << wrong;
-        EXPECT_EQ(balance.phases, 2u);
+        EXPECT_EQ(balance.unbalanced, 2u);
         balance = {};
     }
 }
@@ -67,7 +74,7 @@ TEST_F(PhaseBalance, a_phase_within_four_thirds_and_three_quarters_is_none) {
 TEST_F(PhaseBalance, a_large_error_of_one_phase_accuses_no_other) {
     ratio[2] = 3.0;
     EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
-    EXPECT_EQ(balance.phases, 4u);
+    EXPECT_EQ(balance.unbalanced, 4u);
 }
 
 TEST_F(PhaseBalance, ratios_that_all_phases_have_are_no_sensor_s) {
@@ -83,7 +90,7 @@ TEST_F(PhaseBalance, a_small_ratio_of_all_is_the_encoder_s_after_two_windows) {
     ratio[0] = ratio[1] = ratio[2] = 0.74;
     EXPECT_EQ(window(), 0u);
     EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
-    EXPECT_EQ(balance.phases, 0u);
+    EXPECT_EQ(balance.unbalanced, 0u);
 }
 
 TEST_F(PhaseBalance, revolutions_beyond_100_ms_show_nothing) {
@@ -109,16 +116,16 @@ TEST_F(PhaseBalance, a_phase_that_has_hardly_conducted_is_not_judged_whatever_it
 }
 
 TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_three) {
-    sample.phases = 4;
-    for (const unsigned lost : {0u, 2u, 3u}) {
-        silent = lost;
-        sample.lost = 1u << lost;
+    residual.phases = 4;
+    for (const unsigned absent : {0u, 2u, 3u}) {
+        silent = absent;
+        lost = 1u << absent;
         for (const auto &[wrong, failed] :
              {std::pair{1.36, FAULT_BIT(FAULT_CURRENT_SENSOR)}, std::pair{0.73, FAULT_BIT(FAULT_CURRENT_SENSOR)},
               std::pair{1.3, uint64_t(0)}}) {
             ratio[1] = wrong;
-            EXPECT_EQ(window(), failed) << lost << " " << wrong;
-            EXPECT_EQ(balance.phases, failed != 0 ? 2u : 0u);
+            EXPECT_EQ(window(), failed) << absent << " " << wrong;
+            EXPECT_EQ(balance.unbalanced, failed != 0 ? 2u : 0u);
             balance = {};
         }
         ratio[1] = 1.0;
@@ -127,7 +134,7 @@ TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_thr
 
 TEST_F(PhaseBalance, of_two_phases_that_are_left_neither_is_accused_of_a_difference_but_the_encoder_of_what_both_have) {
     silent = 1;
-    sample.lost = 2u;
+    lost = 2u;
     for (const double wrong : {3.0, 0.4}) {
         ratio[2] = wrong;
         EXPECT_EQ(window(), 0u) << wrong;
@@ -137,7 +144,7 @@ TEST_F(PhaseBalance, of_two_phases_that_are_left_neither_is_accused_of_a_differe
     ratio[0] = ratio[2] = 0.74;
     EXPECT_EQ(window(), 0u);
     EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
-    EXPECT_EQ(balance.phases, 0u);
+    EXPECT_EQ(balance.unbalanced, 0u);
 }
 
 TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {
@@ -145,8 +152,10 @@ TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {
     ASSERT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
     ratio[1] = 1.0;
     EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
-    sample.run = false;
-    EXPECT_EQ(phase_balance_step(&balance, &sample), 0u);
+    residual.run = false;
+    flux_evidence_t evidence{};
+    phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, lost, &evidence);
+    EXPECT_EQ(verdict(evidence), 0u);
 }
 
 } // namespace

@@ -1,0 +1,131 @@
+// Integral of the voltage against the tables: what a sample leaves in the residual. Machine: saturating, 40 kHz, 240 V.
+#include <cstdint>
+#include <utility>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/flux_residual.h"
+}
+
+#include "support/phase_map_results.h"
+
+namespace {
+
+constexpr double Q29 = 536870912.0;
+constexpr uint32_t UNALIGNED = 0x80000000u;
+constexpr uint32_t MIDDLE = 0xC0000000u;
+constexpr int32_t PERIOD_Q29 = int32_t(240.0 * 25e-6 * Q29);
+
+class FluxResidual : public testing::Test {
+  protected:
+    void SetUp() override {
+        input.run = true;
+        input.periods_per_ms = 40;
+        input.stroke = 0x55555555u;
+        input.electrical = UNALIGNED;
+        input.period_flux_q29 = PERIOD_Q29;
+        for (bool &off : input.off) {
+            off = true;
+        }
+    }
+
+    void step() {
+        input.periods++;
+        ASSERT_TRUE(flux_residual_step(&residual, &input));
+        flux_residual_follow(&residual, &input, correction_q29);
+    }
+
+    void set(unsigned phase, double current_A, double flux_Wb) {
+        input.current_q9[phase] = int32_t(current_A * 512.0);
+        input.flux_q29[phase] = int32_t(flux_Wb * Q29);
+        input.off[phase] = false;
+    }
+    double table_Wb(double current_A) const {
+        return phase_map_results::flux_q29(machine_tables, input.electrical, int32_t(current_A * 512.0)) / Q29;
+    }
+
+    flux_residual_t residual{};
+    flux_sample_t input{};
+    int32_t correction_q29[HAL_PHASES_MAX] = {};
+};
+
+TEST_F(FluxResidual, the_resistive_drop_is_summed_from_zero_to_zero_current) {
+    input.resistance_period_q40 = int32_t(2.0 * 25e-6 * 0x1p40);
+    input.electrical = MIDDLE;
+    for (int k = 0; k < 40; k++) {
+        set(0, 10.0, table_Wb(10.0));
+        step();
+    }
+    EXPECT_NEAR(residual.phase[0].drop_q29 / Q29, 40 * 20.0 * 25e-6, 1e-6);
+    EXPECT_LT(residual.phase[0].followed_drop_q29, residual.phase[0].drop_q29);
+    EXPECT_GT(residual.phase[0].followed_drop_q29, residual.phase[0].drop_q29 / 10 * 9) << "a tenth of 10 ms";
+    input.periods += 2;
+    step();
+    EXPECT_NEAR(residual.phase[0].drop_q29 / Q29, 43 * 20.0 * 25e-6, 1e-6);
+    input.current_q9[0] = 0;
+    input.off[0] = true;
+    step();
+    EXPECT_EQ(residual.phase[0].drop_q29, 0);
+    EXPECT_EQ(residual.phase[0].followed_drop_q29, 0);
+}
+
+TEST_F(FluxResidual, psi_by_voltage_is_that_which_follows_less_its_corrections_since_the_last_zero) {
+    step();
+    input.electrical = MIDDLE;
+    double corrections_Wb = 0.0;
+    for (int k = 0; k < 40; k++) {
+        set(0, 10.0, 0.8 * table_Wb(10.0));
+        step();
+        EXPECT_NEAR(residual.phase[0].voltage_q29 / Q29, 0.8 * table_Wb(10.0) - corrections_Wb, 1e-6) << k;
+        corrections_Wb += correction_q29[0] / Q29;
+    }
+    EXPECT_GT(corrections_Wb, 0.01 * table_Wb(10.0));
+    EXPECT_TRUE(residual.phase[0].known);
+    input.current_q9[0] = 0;
+    input.off[0] = true;
+    step();
+    EXPECT_EQ(residual.phase[0].followed_q29, 0);
+    EXPECT_EQ(residual.phase[0].zero_at, input.periods);
+}
+
+TEST_F(FluxResidual, psi_by_voltage_is_unknown_from_a_lost_trigger_to_the_next_zero) {
+    input.electrical = MIDDLE;
+    const auto conduct = [&] {
+        for (int k = 0; k < 10; k++) {
+            set(0, 10.0, table_Wb(10.0));
+            step();
+        }
+    };
+    conduct();
+    input.late_interrupts++;
+    conduct();
+    EXPECT_FALSE(residual.phase[0].known);
+    set(0, 0.0, 0.0);
+    input.off[0] = true;
+    step();
+    conduct();
+    EXPECT_TRUE(residual.phase[0].known);
+}
+
+TEST_F(FluxResidual, limits_of_psi_enclose_the_tables_at_every_resistance_of_a_winding) {
+    constexpr double OHM = 2.0, AMPERE = 10.0, PERIOD_S = 25e-6;
+    input.resistance_period_q40 = int32_t(OHM * PERIOD_S * 0x1p40);
+    input.electrical = MIDDLE;
+    for (const auto &[factor, within] : {std::pair{0.7, true}, {1.0, true}, {1.6, true}, {4.0, false}}) {
+        residual = {};
+        double error_Wb = 0.0;
+        for (int k = 0; k < 120; k++) {
+            set(0, AMPERE, table_Wb(AMPERE) + error_Wb);
+            step();
+            error_Wb += (factor - 1.0) * OHM * AMPERE * PERIOD_S + correction_q29[0] / Q29;
+        }
+        const int32_t table_q29 = residual.phase[0].table_q29;
+        EXPECT_EQ(flux_residual_least_q29(&residual, 0) <= table_q29 &&
+                      flux_residual_most_q29(&residual, 0) >= table_q29,
+                  within)
+            << factor;
+    }
+}
+
+} // namespace

@@ -1,0 +1,112 @@
+// The table of verdicts: precedence, and what each row needs.
+#include <cstdint>
+#include <functional>
+#include <iterator>
+#include <random>
+#include <vector>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "monitors/flux_monitor.h"
+}
+
+namespace {
+
+struct Row {
+    fault_t fault;
+    const char *text;
+    std::function<bool(const flux_evidence_t *e, uint32_t open, uint32_t shorted, uint32_t phase, uint32_t others)>
+        holds;
+};
+
+const Row ROWS[] = {
+#define FLUX_VERDICT(fault, condition, text)                                                                           \
+    {FAULT_##fault, text,                                                                                              \
+     []([[maybe_unused]] const flux_evidence_t *e, [[maybe_unused]] uint32_t open, [[maybe_unused]] uint32_t shorted,  \
+        [[maybe_unused]] uint32_t phase, [[maybe_unused]] uint32_t others) { return bool(condition); }},
+#include "monitors/flux_verdict.def"
+#undef FLUX_VERDICT
+};
+
+// The first row that holds; -1: none.
+int first_row(const flux_evidence_t &e, uint32_t phases) {
+    const uint32_t open = e.too_little | e.too_little_at_angle, shorted = e.excess_moves | e.too_much_at_angle;
+    const uint32_t phase = open | shorted | e.excess_still | e.unbalanced;
+    for (unsigned row = 0; row < std::size(ROWS); row++) {
+        if (ROWS[row].holds(&e, open, shorted, phase, e.contradicts & ~phases)) {
+            return int(row);
+        }
+    }
+    return -1;
+}
+
+TEST(FluxMonitor, the_verdict_is_the_first_row_that_holds_and_each_row_is_the_first_one_of_some_evidence) {
+    std::mt19937 random(1);
+    const auto mask = [&] { return random() % 4 == 0 ? random() & 7u : 0u; };
+    const auto flag = [&] { return random() % 8 == 0; };
+    std::vector<int> first(std::size(ROWS));
+    for (int k = 0; k < 20000; k++) {
+        flux_evidence_t e{};
+        for (uint32_t *member :
+             {&e.too_little, &e.too_little_at_angle, &e.too_much_at_angle, &e.missing, &e.excess_moves, &e.excess_still,
+              &e.excess_by_tables, &e.unbalanced, &e.contradicts}) {
+            *member = mask();
+        }
+        e.excess = e.excess_moves | e.excess_still | e.excess_by_tables | mask();
+        e.parted = flag();
+        e.turned_round = flag();
+        e.contradicts_alone = flag();
+        e.all_small = flag();
+        const uint32_t phases = mask();
+        const int row = first_row(e, phases);
+        ASSERT_EQ(flux_monitor_verdict(&e, phases), row < 0 ? FAULT_NONE : ROWS[row].fault) << k;
+        if (row >= 0) {
+            first[unsigned(row)]++;
+        }
+    }
+    for (unsigned row = 0; row < std::size(ROWS); row++) {
+        EXPECT_GT(first[row], 10) << ROWS[row].text;
+    }
+}
+
+TEST(FluxMonitor, nothing_is_the_verdict_without_evidence) {
+    const flux_evidence_t none{};
+    EXPECT_EQ(flux_monitor_verdict(&none, 0), FAULT_NONE);
+}
+
+TEST(FluxMonitor, a_fault_of_a_phase_is_the_encoder_s_while_another_contradicts_the_angle_or_it_turns_round) {
+    struct {
+        uint32_t contradicts, phases;
+        bool turned_round;
+        fault_t fault;
+    } const cases[] = {{0, 1, false, FAULT_PHASE_OPEN},
+                       {1, 1, false, FAULT_PHASE_OPEN},
+                       {2, 1, false, FAULT_ENCODER_ANGLE},
+                       {2, 3, false, FAULT_PHASE_OPEN},
+                       {0, 1, true, FAULT_ENCODER_ANGLE}};
+    for (const auto &one : cases) {
+        flux_evidence_t evidence{};
+        evidence.too_little = 1;
+        evidence.contradicts = one.contradicts;
+        evidence.turned_round = one.turned_round;
+        EXPECT_EQ(flux_monitor_verdict(&evidence, one.phases), one.fault) << one.contradicts << " " << one.phases;
+    }
+}
+
+TEST(FluxMonitor, a_current_that_one_phase_lacks_and_another_has_is_a_sensor_s) {
+    flux_evidence_t evidence{};
+    evidence.too_little = 1;
+    EXPECT_EQ(flux_monitor_verdict(&evidence, 1), FAULT_PHASE_OPEN);
+    evidence.excess = 2;
+    EXPECT_EQ(flux_monitor_verdict(&evidence, 1), FAULT_CURRENT_SENSOR);
+    evidence = {};
+    evidence.excess = evidence.excess_moves = 2;
+    EXPECT_EQ(flux_monitor_verdict(&evidence, 2), FAULT_PHASE_SHORTED);
+    evidence.missing = 2;
+    EXPECT_EQ(flux_monitor_verdict(&evidence, 2), FAULT_PHASE_SHORTED) << "of the same phase";
+    evidence.missing = 1;
+    EXPECT_EQ(flux_monitor_verdict(&evidence, 2), FAULT_CURRENT_SENSOR);
+}
+
+} // namespace
