@@ -43,7 +43,7 @@ int32_t flux_residual_most_q29(const flux_residual_t *residual, unsigned index) 
 /* Periods since the phase was at rest, those of a small current twice; what lies further back than the time constant
  * has been corrected. */
 static uint32_t conducting(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
-    const uint32_t follow = FLUX_RESIDUAL_FOLLOW_MS * residual->periods_per_ms;
+    const uint32_t follow = FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms;
     const uint32_t step = 2 * (residual->elapsed < follow ? residual->elapsed : follow);
     const uint32_t now = phase->conducting;
     if (phase->small) {
@@ -63,7 +63,7 @@ static bool at_rest(const flux_residual_t *residual, flux_residual_phase_t *phas
     }
     /* Since the previous sample, if the phase was at 0 then already. */
     const uint32_t periods = phase->rest_q29 == 0 ? 1 : residual->elapsed & 0xffffu;
-    phase->rest_q29 = fixed_saturate(phase->rest_q29 + (int64_t)residual->period_flux_q29 * (int32_t)periods);
+    phase->rest_q29 = fixed_saturate(phase->rest_q29 + (int64_t)residual->sample.period_flux_q29 * (int32_t)periods);
     /* The integral of a cold winding is 0 before the flux linkage is. */
     const int32_t remains_q29 = applied_flux_cold_q29(phase->followed_drop_q29);
     return phase->rest_q29 >= fixed_add(fixed_add(phase->peak_q29 / 4, residual->delay_q29), remains_q29);
@@ -75,12 +75,14 @@ static bool saturated(int32_t flux_q29) {
 }
 
 /* R i over the periods between two samples, Wb, Q2.29. */
-static int32_t step_drop_q29(const flux_residual_t *residual, const flux_sample_t *sample, unsigned phase) {
+static int32_t step_drop_q29(const flux_residual_t *residual, unsigned phase) {
+    const flux_sample_t *sample = &residual->sample;
     const int32_t period_q29 = fixed_multiply_high(sample->current_q9[phase] << 12, sample->resistance_period_q40);
     return fixed_non_negative(fixed_saturate((int64_t)period_q29 * (int32_t)(residual->elapsed & 0xffffu)));
 }
 
-static void take_phase(flux_residual_t *residual, const flux_sample_t *sample, unsigned index, uint32_t lost_at) {
+static void take_phase(flux_residual_t *residual, unsigned index, uint32_t lost_at) {
+    const flux_sample_t *sample = &residual->sample;
     flux_residual_phase_t *phase = &residual->phase[index];
     const int32_t current_q9 = sample->current_q9[index];
     phase->misalignment = sample->misalignment[index];
@@ -93,7 +95,7 @@ static void take_phase(flux_residual_t *residual, const flux_sample_t *sample, u
     phase->small = current_q9 <= SMALL_CURRENT * residual->offset_q9;
     phase->table_q29 =
         phase->none ? 0 : phase_map_flux_q29(&machine_tables, phase_map_distance(phase->angle), current_q9);
-    phase->step_drop_q29 = step_drop_q29(residual, sample, index);
+    phase->step_drop_q29 = step_drop_q29(residual, index);
     phase->drop_q29 = fixed_add(phase->drop_q29, phase->step_drop_q29);
     phase->followed_drop_q29 = fixed_add(phase->followed_drop_q29, phase->step_drop_q29);
     phase->known = sample->periods - phase->zero_at < sample->periods - lost_at && !saturated(phase->followed_q29) &&
@@ -109,29 +111,24 @@ static void take_phase(flux_residual_t *residual, const flux_sample_t *sample, u
 
 COLD bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sample) {
     const int32_t period_q29 = sample->period_flux_q29;
-    residual->elapsed = sample->periods - residual->periods;
+    residual->elapsed = sample->periods - residual->sample.periods;
     if (residual->elapsed == 0) {
         return false;
     }
     const uint32_t lost_at = residual->lost_at;
-    residual->lost = sample->late_interrupts != residual->late_interrupts;
+    residual->lost = sample->late_interrupts != residual->sample.late_interrupts;
     residual->lost_at = residual->lost ? sample->periods : lost_at;
-    residual->step = (int32_t)(sample->electrical - residual->electrical);
+    residual->step = (int32_t)(sample->electrical - residual->sample.electrical);
+    residual->sample = *sample;
     residual->phases = machine_tables.phases;
-    residual->run = sample->run;
-    residual->late_interrupts = sample->late_interrupts;
-    residual->periods = sample->periods;
-    residual->electrical = sample->electrical;
-    residual->periods_per_ms = sample->periods_per_ms;
     residual->offset_q9 = machine_tables.current_range_q9 / 128;
-    residual->period_flux_q29 = period_q29;
     residual->delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)sample->periods_per_ms);
     residual->shortest_q29 =
         applied_flux_shortest_pulse_q29(period_q29, machine_tables.minimum_pulse_ns, sample->periods_per_ms);
     residual->pulse_q29 = residual->shortest_q29 > period_q29 / 64 ? residual->shortest_q29 : period_q29 / 64;
     residual->device_q29 = applied_flux_device_q29(&machine_tables, sample->period_q40);
     for (unsigned phase = 0; phase < residual->phases; phase++) {
-        take_phase(residual, sample, phase, lost_at);
+        take_phase(residual, phase, lost_at);
     }
     return true;
 }
@@ -140,20 +137,20 @@ COLD bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sam
 static int32_t correction_of(const flux_residual_t *residual, flux_residual_phase_t *phase, int32_t next_q29) {
     const int32_t flux_q29 = phase->flux_q29;
     if (phase->none) {
-        phase->zero_at = residual->periods;
+        phase->zero_at = residual->sample.periods;
         phase->followed_q29 = phase->drop_q29 = phase->followed_drop_q29 = 0;
         return -flux_q29;
     }
-    if (phase->off && flux_q29 < residual->period_flux_q29 && next_q29 <= 0) {
+    if (phase->off && flux_q29 < residual->sample.period_flux_q29 && next_q29 <= 0) {
         /* The voltage alone ends it: without the corrections, too? */
-        if (phase->voltage_q29 < residual->period_flux_q29) {
-            phase->zero_at = residual->periods;
+        if (phase->voltage_q29 < residual->sample.period_flux_q29) {
+            phase->zero_at = residual->sample.periods;
             phase->followed_q29 = 0;
         }
         return 0;
     }
     const int32_t error_q29 = phase->table_q29 - flux_q29;
-    const int32_t follow = (int32_t)(FLUX_RESIDUAL_FOLLOW_MS * residual->periods_per_ms);
+    const int32_t follow = (int32_t)(FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms);
     const int32_t elapsed = (int32_t)residual->elapsed;
     const bool set = residual->lost || residual->elapsed >= (uint32_t)follow;
     const int32_t correction_q29 = set ? error_q29 : error_q29 / follow * elapsed;
@@ -163,9 +160,8 @@ static int32_t correction_of(const flux_residual_t *residual, flux_residual_phas
     return correction_q29;
 }
 
-COLD void flux_residual_follow(flux_residual_t *residual, const flux_sample_t *sample,
-                               int32_t correction_q29[HAL_PHASES_MAX]) {
+COLD void flux_residual_follow(flux_residual_t *residual, int32_t correction_q29[HAL_PHASES_MAX]) {
     for (unsigned phase = 0; phase < residual->phases; phase++) {
-        correction_q29[phase] = correction_of(residual, &residual->phase[phase], sample->next_q29[phase]);
+        correction_q29[phase] = correction_of(residual, &residual->phase[phase], residual->sample.next_q29[phase]);
     }
 }

@@ -31,10 +31,14 @@
 /* Sample of a control period and what acts in it. */
 typedef struct {
     bool run;                             /* state RUN */
+    uint32_t lost_phases;                 /* bit of each phase that stays off (monitors/degraded.h) */
     uint32_t late_interrupts;             /* since the start: triggers were lost when it changes */
     uint32_t periods;                     /* control periods, modulo 2^32 */
     uint32_t periods_per_ms;              /* from 20 */
+    uint32_t encoder_angle;               /* start of the encoder count, 2^-32 rev */
     uint32_t electrical;                  /* angle of phase 0 at the sample, 2^-32 electrical rev */
+    int32_t speed_q22;                    /* of the observer, rad/s, Q9.22 */
+    int32_t torque_q24;                   /* of the speed law, N m, Q7.24 */
     uint32_t stroke;                      /* 2^32 / phases */
     int32_t period_q40;                   /* Ts, s, Q-9.40 */
     int32_t period_flux_q29;              /* Vdc Ts, Wb, Q2.29 */
@@ -73,18 +77,13 @@ typedef struct {
 
 typedef struct {
     unsigned phases;
-    bool run; /* in the sample; so are the next three */
-    uint32_t late_interrupts;
-    uint32_t periods;
-    uint32_t electrical;
-    uint32_t periods_per_ms;
-    bool lost;               /* triggers were lost since the previous sample: the integrals are wrong */
-    uint32_t lost_at;        /* period of the last sample with lost triggers */
-    uint32_t elapsed;        /* control periods since the previous sample */
-    int32_t step;            /* rotation since then, 2^-32 electrical rev */
-    int32_t offset_q9;       /* tolerance of a current, 1/128 of its range, A, Q7.9 */
-    int32_t period_flux_q29; /* Vdc Ts, Wb, Q2.29 */
-    int32_t delay_q29;       /* tolerance of a flux linkage for delays, Wb, Q2.29 */
+    flux_sample_t sample;
+    bool lost;         /* triggers were lost since the previous sample: the integrals are wrong */
+    uint32_t lost_at;  /* period of the last sample with lost triggers */
+    uint32_t elapsed;  /* control periods since the previous sample */
+    int32_t step;      /* rotation since then, 2^-32 electrical rev */
+    int32_t offset_q9; /* tolerance of a current, 1/128 of its range, A, Q7.9 */
+    int32_t delay_q29; /* tolerance of a flux linkage for delays, Wb, Q2.29 */
     /* Errors in a period, Wb, Q2.29: */
     int32_t shortest_q29; /* the converter's shortest pulse */
     int32_t pulse_q29;    /* 1/64 of the voltage, or the shortest pulse if that is more */
@@ -101,8 +100,7 @@ typedef struct {
 bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sample);
 
 /* Ends a sample: what psi(f) has to be corrected by, Wb, Q2.29, for each phase. [background] */
-void flux_residual_follow(flux_residual_t *residual, const flux_sample_t *sample,
-                          int32_t correction_q29[HAL_PHASES_MAX]);
+void flux_residual_follow(flux_residual_t *residual, int32_t correction_q29[HAL_PHASES_MAX]);
 
 /* Least and largest psi(f) by its tolerance, Wb, Q2.29. */
 int32_t flux_residual_least_q29(const flux_residual_t *residual, unsigned phase);

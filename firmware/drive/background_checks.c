@@ -29,7 +29,6 @@ COLD static void read_stall_input(const control_state_t *control, stall_input_t 
 typedef struct {
     stall_input_t stall;
     flux_sample_t flux;
-    uint32_t encoder_angle;
 } sample_t;
 
 COLD static bool read_sample(const control_state_t *control, const control_parameters_t *parameters, sample_t *sample) {
@@ -43,7 +42,9 @@ COLD static bool read_sample(const control_state_t *control, const control_param
         input->electrical = measured->commutation.electrical;
         input->period_flux_q29 =
             applied_flux_period_q29(measured->dc_link_voltage_q6, parameters->predictive.period_q40);
-        sample->encoder_angle = measured->encoder_angle;
+        input->encoder_angle = measured->encoder_angle;
+        input->speed_q22 = control->observer.speed_q22;
+        input->torque_q24 = control->torque_reference_q24;
         const int32_t *misalignment = deferred_in_effect(control)->predictive.misalignment;
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             input->misalignment[phase] = misalignment[phase];
@@ -64,9 +65,9 @@ COLD static bool read_sample(const control_state_t *control, const control_param
 #define FLUX_ANGLE_SPEED_MIN_Q22 (1u << 21)
 
 /* Misalignment of the phases by their flux linkage. */
-static void follow_misalignment(drive_t *drive, int32_t speed_q22) {
+static void follow_misalignment(drive_t *drive) {
     const flux_residual_t *residual = &drive->flux.residual;
-    const bool turns = fixed_magnitude(speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
+    const bool turns = fixed_magnitude(residual->sample.speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
     const int32_t periods =
         (int32_t)(residual->elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
     for (unsigned index = 0; index < machine_tables.phases; index++) {
@@ -79,10 +80,10 @@ static void follow_misalignment(drive_t *drive, int32_t speed_q22) {
             .flux_q29 = phase->voltage_q29,
             .table_q29 = phase->table_q29,
             .resistive_q29 = phase->step_drop_q29,
-            .time_q29 = (residual->period_flux_q29 >> 8) * periods,
+            .time_q29 = (residual->sample.period_flux_q29 >> 8) * periods,
             .counts = turns && phase->known && !phase->off && phase->current_q9 > machine_tables.current_range_q9 / 64,
         };
-        if (!residual->run) {
+        if (!residual->sample.run) {
             *flux_angle = (flux_angle_t){0};
             drive->control.flux_misalignment[index] = 0;
         } else if (flux_angle_add(flux_angle, &machine_tables, &sample)) {
@@ -162,19 +163,13 @@ static void follow_table_scale(drive_t *drive, const flux_sample_t *input,
 }
 
 /* Checks phases and encoder, and corrects the integrals. */
-COLD static uint32_t check_flux(drive_t *drive, const sample_t *sample) {
-    const flux_sample_t *input = &sample->flux;
-    const flux_monitor_motion_t motion = {
-        .encoder_angle = sample->encoder_angle,
-        .speed_q22 = sample->stall.speed_q22,
-        .torque_q24 = sample->stall.torque_reference_q24,
-    };
-    const uint32_t failed = flux_monitor_step(&drive->control_parameters.flux_monitor, &drive->flux, input, &motion);
+COLD static uint32_t check_flux(drive_t *drive, const flux_sample_t *input) {
+    const uint32_t failed = flux_monitor_step(&drive->control_parameters.flux_monitor, &drive->flux, input);
     if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
-        follow_misalignment(drive, motion.speed_q22);
+        follow_misalignment(drive);
     }
     int32_t correction_q29[HAL_PHASES_MAX];
-    flux_residual_follow(&drive->flux.residual, input, correction_q29);
+    flux_residual_follow(&drive->flux.residual, correction_q29);
     drive->conduction_ends = false;
     if (input->run) {
         follow_table_scale(drive, input, correction_q29);
@@ -227,13 +222,12 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
     if (degraded_accepts(parameters, &drive->degraded, run, failed, drive->flux.phases)) {
         drive->control.lost_phase = (uint32_t)__builtin_ctz(drive->degraded.lost) + 1u;
-        flux_monitor_lose(&drive->flux, drive->degraded.lost);
+        flux_monitor_forget(&drive->flux);
         failed = 0;
     } else if (!run && drive->degraded.lost != 0 &&
                (drive->command.request == COMMAND_CLEAR_FAULT || !parameters->allowed)) {
         drive->degraded.lost = 0;
         drive->control.lost_phase = 0;
-        flux_monitor_lose(&drive->flux, 0);
     }
     degraded_step(parameters, &drive->degraded, &machine_tables);
     return failed;
@@ -242,14 +236,15 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
 /* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
 COLD static void check(drive_t *drive, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
-    sample_t sample = {.flux = {.periods_per_ms = parameters->initialise_ticks,
+    sample_t sample = {.flux = {.lost_phases = drive->degraded.lost,
+                                .periods_per_ms = parameters->initialise_ticks,
                                 .stroke = parameters->commutation.stroke,
                                 .period_q40 = parameters->predictive.period_q40,
                                 .resistance_period_q40 = parameters->predictive.flux.resistance_period_q40}};
     if (!read_sample(&drive->control, parameters, &sample)) {
         return;
     }
-    uint32_t failed = follow_lost_phase(drive, check_flux(drive, &sample));
+    uint32_t failed = follow_lost_phase(drive, check_flux(drive, &sample.flux));
     if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
     }
@@ -267,7 +262,7 @@ COLD void background_checks(drive_t *drive, uint32_t time_us) {
     test_itself(drive, time_us);
     const bool suspicious = drive->flux.evidence.suspicious || drive->conduction_ends;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
-    if (unmasked_read_periods(&drive->control.deferred_request) - drive->flux.residual.periods >= spacing) {
+    if (unmasked_read_periods(&drive->control.deferred_request) - drive->flux.residual.sample.periods >= spacing) {
         check(drive, time_us);
     }
     uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal) | temperature_faults(&drive->temperature) |

@@ -89,9 +89,8 @@ typedef struct {
     int64_t drift_q29;        /* the same as long as the rotor has not been seen to move in this run */
 } common_t;
 
-static common_t common_of(const angle_evidence_parameters_t *parameters, const flux_residual_t *residual,
-                          uint32_t encoder_angle, bool moves) {
-    const int32_t part_q29 = residual->period_flux_q29 >> PART_SHIFT;
+static common_t common_of(const angle_evidence_parameters_t *parameters, const flux_residual_t *residual, bool moves) {
+    const int32_t part_q29 = residual->sample.period_flux_q29 >> PART_SHIFT;
     const int32_t short_q29 = part_q29 * (int32_t)(parameters->rate_hz / SHORT_PERIOD_HZ);
     const int32_t suppressed_q29 = residual->shortest_q29 / 2; /* on average */
     const int32_t device_q29 = residual->device_q29;
@@ -103,14 +102,15 @@ static common_t common_of(const angle_evidence_parameters_t *parameters, const f
     return (common_t){
         .parameters = parameters,
         .residual = residual,
-        .electrical = commutation_electrical(&parameters->commutation, encoder_angle + parameters->middle),
+        .electrical =
+            commutation_electrical(&parameters->commutation, residual->sample.encoder_angle + parameters->middle),
         .moving_drift_q29 = moving_q29,
         .drift_q29 = moves ? moving_q29 : standing_q29,
     };
 }
 
 static uint32_t age_of(const common_t *common, const flux_residual_phase_t *phase) {
-    return common->residual->periods - phase->zero_at;
+    return common->residual->sample.periods - phase->zero_at;
 }
 
 static flux_band_t band_of(const flux_residual_phase_t *phase, uint32_t distance, uint32_t width,
@@ -127,7 +127,8 @@ static int32_t drift_since_zero_q29(const common_t *common, const flux_residual_
     const int64_t resistive_q29 = small ? applied_flux_cold_q29(phase->drop_q29)
                                         : applied_flux_warm_q29(&machine_tables, phase->drop_q29) + device_q29;
     const int64_t drift_q29 = common->moving_drift_q29 * (int32_t)age;
-    return fixed_saturate(common->residual->period_flux_q29 / 4 + applied_flux_independent(drift_q29, resistive_q29));
+    return fixed_saturate(common->residual->sample.period_flux_q29 / 4 +
+                          applied_flux_independent(drift_q29, resistive_q29));
 }
 
 /* An integral that is too old to contradict the angle. */
@@ -159,7 +160,7 @@ static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
  * phase.
  */
 static int32_t fastest_parting_q29(const common_t *common) {
-    const int32_t turning_q29 = common->residual->period_flux_q29 / 16;
+    const int32_t turning_q29 = common->residual->sample.period_flux_q29 / 16;
     const int32_t from_rest_q29 = fixed_saturate(8 * (int64_t)common->parameters->flux_error_q29);
     return turning_q29 > from_rest_q29 ? turning_q29 : from_rest_q29;
 }
@@ -170,7 +171,7 @@ static void refer(const common_t *common, angle_evidence_phase_t *state, const f
     state->current_q9 = phase->current_q9;
     state->excess_q29 = state->last_excess_q29 = excess_q29;
     state->table_q29 = state->last_table_q29 = table_q29;
-    state->referred_at = common->residual->periods;
+    state->referred_at = common->residual->sample.periods;
     state->zero_at = phase->zero_at;
     state->drop_q29 = 0;
     state->moved = 0;
@@ -189,7 +190,7 @@ static bool has_moved(const common_t *common, angle_evidence_phase_t *state, con
         return false;
     }
     const uint32_t leak_periods = rate_hz >> LEAK_SHIFT;
-    const uint32_t age = common->residual->periods - state->referred_at;
+    const uint32_t age = common->residual->sample.periods - state->referred_at;
     const uint32_t summed = age < leak_periods ? age : leak_periods;
     state->drop_q29 = fixed_add(state->drop_q29, phase->step_drop_q29);
     const bool falls = excess_q29 < state->excess_q29;
@@ -249,7 +250,7 @@ static bool contradicts(const common_t *common, angle_evidence_phase_t *state, c
 static bool interrupted(const common_t *common, angle_evidence_phase_t *state, const flux_residual_phase_t *phase) {
     const int32_t moved_q9 = fixed_abs(phase->current_q9 - state->last_current_q9);
     const int64_t moved_q29 = fixed_abs(fixed_subtract(phase->voltage_q29, state->last_flux_q29));
-    const int64_t most_q29 = moved_q29 + (int64_t)common->residual->period_flux_q29 * common->residual->elapsed;
+    const int64_t most_q29 = moved_q29 + (int64_t)common->residual->sample.period_flux_q29 * common->residual->elapsed;
     if (state->conducts && phase_map_flux_q29(&machine_tables, 0, moved_q9) > most_q29) {
         state->interrupted = true;
         state->interrupted_zero_at = phase->zero_at;
@@ -263,7 +264,7 @@ static bool interrupted(const common_t *common, angle_evidence_phase_t *state, c
 
 /* True while a phase has shown a contradiction in the last quarter of a second. */
 static bool shows(const common_t *common, angle_evidence_phase_t *state) {
-    const uint32_t period = common->residual->periods;
+    const uint32_t period = common->residual->sample.periods;
     if (state->contradicted >= PERSISTENT_PERIODS) {
         state->shown_from = state->shown ? state->shown_from : period;
         state->shown = true;
@@ -279,21 +280,21 @@ static void note_agreement(const common_t *common, angle_evidence_phase_t *state
     state->agrees = state->contradicted == 0 ? state->agrees + common->residual->elapsed : 0;
     if (state->agrees > common->parameters->rate_hz >> AGREES_SHIFT) {
         state->agreed = true;
-        state->agreed_at = common->residual->periods;
+        state->agreed_at = common->residual->sample.periods;
     }
 }
 
 /* True when two of the other phases, or all that are not lost, have been consistent with the angle in the last quarter
  * of a second. One that is left is enough: what it has shown, it contradicts when it conducts the next time, if the
  * encoder is wrong. */
-static bool others_agree(const common_t *common, angle_evidence_t *state, unsigned index, uint32_t lost_phases) {
+static bool others_agree(const common_t *common, angle_evidence_t *state, unsigned index) {
     bool all = true;
     unsigned agreeing = 0;
     for (unsigned other = 0; other < common->residual->phases; other++) {
         angle_evidence_phase_t *phase = &state->phase[other];
-        const uint32_t since = common->residual->periods - phase->agreed_at;
+        const uint32_t since = common->residual->sample.periods - phase->agreed_at;
         phase->agreed = phase->agreed && since <= common->parameters->rate_hz >> SHOWN_SHIFT;
-        if (other != index && (lost_phases >> other & 1u) == 0) {
+        if (other != index && (common->residual->sample.lost_phases >> other & 1u) == 0) {
             all &= phase->agreed;
             agreeing += phase->agreed;
         }
@@ -302,19 +303,19 @@ static bool others_agree(const common_t *common, angle_evidence_t *state, unsign
 }
 
 /* True while the encoder shows a rotor that turns the way the torque drives it. */
-static bool advances(const common_t *common, angle_evidence_t *state, const angle_evidence_input_t *input) {
+static bool advances(const common_t *common, angle_evidence_t *state) {
+    const flux_sample_t *sample = &common->residual->sample;
     const int32_t least = common->parameters->advance_min;
-    const uint32_t period = common->residual->periods;
-    const int32_t travel = (int32_t)(input->encoder_angle - state->waypoint);
-    const int32_t advance = input->torque_q24 < 0 ? fixed_subtract(0, travel) : travel;
+    const int32_t travel = (int32_t)(sample->encoder_angle - state->waypoint);
+    const int32_t advance = sample->torque_q24 < 0 ? fixed_subtract(0, travel) : travel;
     if (advance < 0 || advance >= least) {
-        state->waypoint = input->encoder_angle;
+        state->waypoint = sample->encoder_angle;
     }
     if (advance >= least) {
         state->advanced = true;
-        state->advanced_at = period;
+        state->advanced_at = sample->periods;
     }
-    return state->advanced && period - state->advanced_at <= common->parameters->rate_hz >> ALONE_SHIFT;
+    return state->advanced && sample->periods - state->advanced_at <= common->parameters->rate_hz >> ALONE_SHIFT;
 }
 
 static void check_phase(const common_t *common, angle_evidence_t *state, unsigned index, bool counted,
@@ -354,11 +355,11 @@ static void forget(angle_evidence_t *state, uint32_t encoder_angle) {
 }
 
 COLD void angle_evidence_step(const angle_evidence_parameters_t *parameters, angle_evidence_t *state,
-                              const flux_residual_t *residual, const angle_evidence_input_t *input,
-                              flux_evidence_t *evidence) {
-    const bool counted = state->started && input->encoder_angle != state->encoder_angle;
+                              const flux_residual_t *residual, flux_evidence_t *evidence) {
+    const uint32_t encoder_angle = residual->sample.encoder_angle;
+    const bool counted = state->started && encoder_angle != state->encoder_angle;
     state->started = true;
-    state->encoder_angle = input->encoder_angle;
+    state->encoder_angle = encoder_angle;
     if (counted) {
         state->parted = false;
         state->counted = true;
@@ -366,18 +367,18 @@ COLD void angle_evidence_step(const angle_evidence_parameters_t *parameters, ang
             state->phase[phase].referred = false;
         }
     }
-    if (residual->run) {
-        const common_t common = common_of(parameters, residual, input->encoder_angle, state->counted);
-        const bool next_decides = advances(&common, state, input);
+    if (residual->sample.run) {
+        const common_t common = common_of(parameters, residual, state->counted);
+        const bool next_decides = advances(&common, state);
         for (unsigned phase = 0; phase < residual->phases; phase++) {
             check_phase(&common, state, phase, counted, evidence);
-            const uint32_t since = residual->periods - state->phase[phase].shown_from;
+            const uint32_t since = residual->sample.periods - state->phase[phase].shown_from;
             const bool waits = next_decides && since <= parameters->rate_hz >> WAIT_SHIFT;
             evidence->contradicts_alone |= state->phase[phase].contradicted > parameters->rate_hz >> ALONE_SHIFT &&
-                                           !waits && !others_agree(&common, state, phase, input->lost_phases);
+                                           !waits && !others_agree(&common, state, phase);
         }
     } else {
-        forget(state, input->encoder_angle);
+        forget(state, encoder_angle);
     }
     evidence->parted = state->parted;
 }

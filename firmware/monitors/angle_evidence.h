@@ -46,13 +46,6 @@ typedef struct {
     int32_t current_min_q9; /* of a phase that is checked, A, Q7.9 */
 } angle_evidence_parameters_t;
 
-/* The encoder's count and the torque at a sample. */
-typedef struct {
-    uint32_t encoder_angle; /* start of the encoder count, 2^-32 rev */
-    int32_t torque_q24;     /* of the speed law, N m, Q7.24 */
-    uint32_t lost_phases;   /* bit of each phase that stays off (monitors/degraded.h) */
-} angle_evidence_input_t;
-
 /* Of a phase. */
 typedef struct {
     bool referred;           /* current to zero_at are set */
@@ -98,7 +91,6 @@ int32_t angle_evidence_flux_error_q29(int64_t acceleration, int32_t current_q9, 
 
 /* Adds the evidence of a sample. `parted` remains until the encoder counts; the others are of a run. [background] */
 void angle_evidence_step(const angle_evidence_parameters_t *parameters, angle_evidence_t *state,
-                         const flux_residual_t *residual, const angle_evidence_input_t *input,
-                         flux_evidence_t *evidence);
+                         const flux_residual_t *residual, flux_evidence_t *evidence);
 
 #endif

@@ -38,39 +38,41 @@ static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear
 }
 
 static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
-                        const encoder_monitor_input_t *input) {
-    const uint32_t periods = input->period - monitor->window_period;
-    if (input->lost) { /* the window was longer than its periods */
-        monitor->window_period = input->period;
-        monitor->window_angle = input->encoder_angle;
+                        const flux_residual_t *residual) {
+    const flux_sample_t *sample = &residual->sample;
+    const uint32_t periods = sample->periods - monitor->window_period;
+    if (residual->lost) { /* the window was longer than its periods */
+        monitor->window_period = sample->periods;
+        monitor->window_angle = sample->encoder_angle;
         monitor->turned = false;
         return;
     }
     if (periods < parameters->rate_hz >> WINDOW_SHIFT) {
         return;
     }
-    const int32_t turned = (int32_t)(input->encoder_angle - monitor->window_angle);
+    const int32_t turned = (int32_t)(sample->encoder_angle - monitor->window_angle);
     const uint32_t travel = (uint32_t)fixed_abs(turned);
     const uint64_t limit = (uint64_t)parameters->travel * periods;
     const uint64_t count = 2 * (uint64_t)parameters->middle;
-    const bool above = fixed_abs(input->speed_q22) > parameters->over_speed_q22;
+    const bool above = fixed_abs(sample->speed_q22) > parameters->over_speed_q22;
     monitor->over_speed =
         limit < TRAVEL_SEEN && (travel > limit + limit / 16 + count || (above && travel + count > limit - limit / 32));
-    monitor->window_period = input->period;
-    monitor->window_angle = input->encoder_angle;
+    monitor->window_period = sample->periods;
+    monitor->window_angle = sample->encoder_angle;
     const uint64_t change = (uint64_t)parameters->travel_change * periods * periods * REVERSAL_WINDOWS / 2u;
     const uint64_t least = limit >> REVERSAL_SHIFT;
     note_reversal(monitor, turned, travel > (least > change ? least : change) + count, parameters->rate_hz);
 }
 
 COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
-                               const encoder_monitor_input_t *input) {
+                               const flux_residual_t *residual) {
+    const flux_sample_t *sample = &residual->sample;
     if (!monitor->started) {
         monitor->started = true;
-        monitor->window_period = input->period;
-        monitor->window_angle = input->encoder_angle;
+        monitor->window_period = sample->periods;
+        monitor->window_angle = sample->encoder_angle;
     }
-    check_speed(parameters, monitor, input);
+    check_speed(parameters, monitor, residual);
     monitor->turned_round =
-        monitor->reversed && input->period - monitor->reversed_at <= parameters->rate_hz >> REVERSED_SHIFT;
+        monitor->reversed && sample->periods - monitor->reversed_at <= parameters->rate_hz >> REVERSED_SHIFT;
 }

@@ -13,6 +13,8 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/flux_residual.h"
+
 typedef struct {
     uint32_t middle;        /* of a count, 2^-32 rev */
     uint32_t rate_hz;       /* of the control periods */
@@ -20,13 +22,6 @@ typedef struct {
     int32_t travel;         /* of a period at that speed, 2^-32 rev */
     int32_t travel_change;  /* from period to period, the largest of a rotor, 2^-32 rev */
 } encoder_monitor_parameters_t;
-
-typedef struct {
-    uint32_t period;        /* of the sample, modulo 2^32 */
-    bool lost;              /* triggers were lost since the previous input */
-    uint32_t encoder_angle; /* start of the encoder count, 2^-32 rev */
-    int32_t speed_q22;      /* of the observer, rad/s, Q9.22 */
-} encoder_monitor_input_t;
 
 typedef struct {
     bool over_speed, turned_round;
@@ -40,8 +35,8 @@ typedef struct {
     uint32_t reversed_at;
 } encoder_monitor_t;
 
-/* Checks the sample of a period. [background] */
+/* Checks a sample. [background] */
 void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
-                          const encoder_monitor_input_t *input);
+                          const flux_residual_t *residual);
 
 #endif

@@ -34,43 +34,27 @@ static uint32_t failed_phases(const flux_evidence_t *evidence) {
     return failed;
 }
 
-void flux_monitor_lose(flux_monitor_t *monitor, uint32_t phases) {
-    monitor->lost = phases;
+void flux_monitor_forget(flux_monitor_t *monitor) {
     monitor->failed = 0;
     monitor->balance = (phase_balance_t){0};
     phase_evidence_forget(&monitor->phases_by_current);
 }
 
 COLD uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
-                                const flux_sample_t *sample, const flux_monitor_motion_t *motion) {
+                                const flux_sample_t *sample) {
     flux_residual_t *residual = &monitor->residual;
     flux_evidence_t *evidence = &monitor->evidence;
-    const bool was_run = residual->run;
+    const bool begins = sample->run && !residual->sample.run;
     if (!flux_residual_step(residual, sample)) {
         return monitor->failed;
     }
-    const encoder_monitor_input_t counts = {
-        .period = residual->periods,
-        .lost = residual->lost,
-        .encoder_angle = motion->encoder_angle,
-        .speed_q22 = motion->speed_q22,
-    };
-    const angle_evidence_input_t angle = {
-        .encoder_angle = motion->encoder_angle,
-        .torque_q24 = motion->torque_q24,
-        .lost_phases = monitor->lost,
-    };
-    *evidence = (flux_evidence_t){0};
-    encoder_monitor_step(&parameters->encoder, &monitor->encoder, &counts);
-    evidence->turned_round = monitor->encoder.turned_round;
-    angle_evidence_step(&parameters->angle, &monitor->angle, residual, &angle, evidence);
-    phase_evidence_step(&monitor->phases_by_current, residual, monitor->lost, evidence);
-    phase_balance_step(&monitor->balance, residual, parameters->least_q8, monitor->lost, evidence);
-    if (residual->run && !was_run) {
-        monitor->phases = 0;
-    }
-    monitor->phases |= failed_phases(evidence);
+    encoder_monitor_step(&parameters->encoder, &monitor->encoder, residual);
+    *evidence = (flux_evidence_t){.turned_round = monitor->encoder.turned_round};
+    angle_evidence_step(&parameters->angle, &monitor->angle, residual, evidence);
+    phase_evidence_step(&monitor->phases_by_current, residual, evidence);
+    phase_balance_step(&monitor->balance, residual, parameters->least_q8, evidence);
+    monitor->phases = (begins ? 0 : monitor->phases) | failed_phases(evidence);
     const uint32_t failed = (uint32_t)FAULT_BIT(flux_monitor_verdict(evidence, monitor->phases)) & ~1u;
-    monitor->failed = residual->run ? monitor->failed | failed : failed;
+    monitor->failed = sample->run ? monitor->failed | failed : failed;
     return monitor->failed;
 }

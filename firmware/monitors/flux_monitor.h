@@ -29,15 +29,7 @@ typedef struct {
     flux_evidence_t evidence; /* of the last sample */
     uint32_t failed;          /* FAULT_BITs of the verdicts, of a run until its end */
     uint32_t phases;          /* bit of each phase with evidence of a fault since the last run began */
-    uint32_t lost;            /* bit of each phase that stays off, flux_monitor_lose() */
 } flux_monitor_t;
-
-/* Motion at a sample. */
-typedef struct {
-    uint32_t encoder_angle; /* start of the encoder count, 2^-32 rev */
-    int32_t speed_q22;      /* of the observer, rad/s, Q9.22 */
-    int32_t torque_q24;     /* of the speed law, N m, Q7.24 */
-} flux_monitor_motion_t;
 
 /* The fault that the evidence shows, FAULT_NONE without one. phases: bit of each phase with evidence of a fault in this
  * run. */
@@ -46,11 +38,9 @@ fault_t flux_monitor_verdict(const flux_evidence_t *evidence, uint32_t phases);
 /* Checks a sample: failed checks, FAULT_BITs. A sample of the period of the previous one changes nothing. The residual
  * then is of this sample, and flux_residual_follow() ends it. [background] */
 uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
-                           const flux_sample_t *sample, const flux_monitor_motion_t *motion);
+                           const flux_sample_t *sample);
 
-/* Forgets the failed checks of a run that goes on without these phases, a bit each: their switches stay open, and from
- * now on only a current in them fails, once the voltage has removed their flux linkage. 0: none are lost.
- * [background] */
-void flux_monitor_lose(flux_monitor_t *monitor, uint32_t phases);
+/* Forgets the failed checks of a run that goes on without the phases that have caused them. [background] */
+void flux_monitor_forget(flux_monitor_t *monitor);
 
 #endif

@@ -24,12 +24,12 @@
 /* True of a phase that conducts above the currents whose errors are those of the converter, for so short a time that a
  * warm winding and the error of the voltage are less than half of the flux linkage. */
 static bool counts(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
-    const uint32_t recent = RECENT_MS * residual->periods_per_ms;
-    const uint32_t age = residual->periods - phase->zero_at;
+    const uint32_t recent = RECENT_MS * residual->sample.periods_per_ms;
+    const uint32_t age = residual->sample.periods - phase->zero_at;
     if (!phase->known || age >= recent || phase->current_q9 <= machine_tables.current_range_q9 / 32) {
         return false;
     }
-    const int32_t part_q29 = residual->period_flux_q29 / 64;
+    const int32_t part_q29 = residual->sample.period_flux_q29 / 64;
     const int32_t voltage_q29 = residual->device_q29 > part_q29 ? residual->device_q29 : part_q29;
     const int64_t warm_q29 = applied_flux_warm_q29(&machine_tables, phase->drop_q29);
     return warm_q29 + fixed_product(voltage_q29, (int32_t)age) < phase->table_q29 / 2;
@@ -83,7 +83,8 @@ static bool differs(const uint32_t *ratios_q8, unsigned phases, unsigned index) 
 }
 
 /* At the end of a window. */
-static void judge(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8, uint32_t lost_phases) {
+static void judge(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8) {
+    const uint32_t lost_phases = residual->sample.lost_phases;
     const unsigned phases = residual->phases;
     uint32_t ratios_q8[HAL_PHASES_MAX] = {0};
     uint32_t judged = lost_phases;
@@ -105,8 +106,8 @@ static void judge(phase_balance_t *balance, const flux_residual_t *residual, uin
 }
 
 COLD void phase_balance_step(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8,
-                             uint32_t lost_phases, flux_evidence_t *evidence) {
-    if (!residual->run) {
+                             flux_evidence_t *evidence) {
+    if (!residual->sample.run) {
         *balance = (phase_balance_t){0};
         return;
     }
@@ -114,8 +115,8 @@ COLD void phase_balance_step(phase_balance_t *balance, const flux_residual_t *re
     balance->periods += residual->elapsed;
     balance->turned += (uint32_t)fixed_abs(residual->step);
     if (balance->turned >> 32 >= REVOLUTIONS) {
-        if (balance->periods < REVOLUTIONS * SLOWEST_MS * residual->periods_per_ms) {
-            judge(balance, residual, least_q8, lost_phases);
+        if (balance->periods < REVOLUTIONS * SLOWEST_MS * residual->sample.periods_per_ms) {
+            judge(balance, residual, least_q8);
         }
         begin(balance);
     }

@@ -44,9 +44,8 @@ typedef struct {
     phase_balance_phase_t phase[HAL_PHASES_MAX];
 } phase_balance_t;
 
-/* Adds the evidence of a sample. least_q8: limit of the common ratio. lost_phases: bit of each phase that stays off
- * (monitors/degraded.h). [background] */
+/* Adds the evidence of a sample. least_q8: limit of the common ratio. [background] */
 void phase_balance_step(phase_balance_t *balance, const flux_residual_t *residual, uint32_t least_q8,
-                        uint32_t lost_phases, flux_evidence_t *evidence);
+                        flux_evidence_t *evidence);
 
 #endif

@@ -68,7 +68,8 @@ static int32_t built_up_q29(const flux_residual_t *residual, phase_evidence_phas
 static difference_t compare(const flux_residual_t *residual, phase_evidence_phase_t *state, unsigned index, int *side) {
     const flux_residual_phase_t *phase = &residual->phase[index];
     const int32_t table_q29 = phase->table_q29;
-    if (!phase->small || phase->flux_q29 < state->base_q29 || residual->elapsed > residual->periods_per_ms / 2u) {
+    if (!phase->small || phase->flux_q29 < state->base_q29 ||
+        residual->elapsed > residual->sample.periods_per_ms / 2u) {
         state->base_q29 = phase->flux_q29;
     }
     /* With a small current errors of the past do not count. */
@@ -124,8 +125,8 @@ static bool does_not_fall(const flux_residual_t *residual, phase_evidence_phase_
  * time alone the current may flow, and it is the angle of the tables that is wrong. At most all of it: what is more has
  * added up in a long stroke. */
 static bool taken_away(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
-    const uint32_t age = residual->periods - phase->zero_at;
-    const bool was_small = phase->conducting > FLUX_RESIDUAL_FOLLOW_MS * residual->periods_per_ms;
+    const uint32_t age = residual->sample.periods - phase->zero_at;
+    const bool was_small = phase->conducting > FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms;
     const int64_t drops_q29 = (int64_t)(error_q29(residual) / 7 * (was_small ? 2 : 1)) * age;
     const int64_t taken_q29 = -(int64_t)phase->followed_q29;
     const int32_t warm_q29 = applied_flux_warm_q29(&machine_tables, phase->drop_q29);
@@ -138,7 +139,7 @@ static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t
     const flux_residual_phase_t *phase = &residual->phase[index];
     const int32_t current_q9 = phase->current_q9;
     if (!excess) {
-        const bool lasted = state->excess_periods >= residual->periods_per_ms / 2u;
+        const bool lasted = state->excess_periods >= residual->sample.periods_per_ms / 2u;
         evidence->excess_still |= (uint32_t)lasted << index;
         state->excess_periods = 0;
         return;
@@ -151,7 +152,7 @@ static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t
     state->most_q9 = current_q9 > state->most_q9 ? current_q9 : state->most_q9;
     state->excess_periods += state->excess_periods == 0 ? 1 : residual->elapsed;
     const int32_t moved_q9 = state->most_q9 - state->least_q9;
-    if (state->excess_periods <= residual->periods_per_ms / 4u) {
+    if (state->excess_periods <= residual->sample.periods_per_ms / 4u) {
         return;
     }
     if (moved_q9 > residual->offset_q9) {
@@ -160,7 +161,7 @@ static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t
         evidence->excess_moves |= (uint32_t)!by_tables << index;
         return;
     }
-    const bool still = moved_q9 == 0 || state->excess_periods > STILL_MS * residual->periods_per_ms;
+    const bool still = moved_q9 == 0 || state->excess_periods > STILL_MS * residual->sample.periods_per_ms;
     evidence->excess_still |= (uint32_t)still << index;
 }
 
@@ -170,24 +171,25 @@ static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *
     const flux_residual_phase_t *phase = &residual->phase[index];
     if (phase->none && phase->flux_q29 > fixed_add(phase->peak_q29 / 8, 2 * residual->delay_q29)) {
         state->vanished = true;
-        state->vanished_at = residual->periods;
+        state->vanished_at = residual->sample.periods;
     }
-    const bool vanished =
-        state->vanished && residual->periods - state->vanished_at < VANISHED_MS * residual->periods_per_ms;
+    const bool vanished = state->vanished &&
+                          residual->sample.periods - state->vanished_at < VANISHED_MS * residual->sample.periods_per_ms;
     const bool less = flux_residual_least_q29(residual, index) > fixed_add(phase->table_q29, phase->table_q29 / 4);
     const bool none =
         !phase->off && phase->current_q9 <= residual->offset_q9 && phase->flux_q29 > residual->delay_q29 / 2;
     return vanished || less || none;
 }
 
-static void check_phase(const flux_residual_t *residual, phase_evidence_t *state, unsigned index, bool is_lost,
+static void check_phase(const flux_residual_t *residual, phase_evidence_t *state, unsigned index,
                         flux_evidence_t *evidence) {
+    const bool is_lost = (residual->sample.lost_phases >> index & 1u) != 0;
     phase_evidence_phase_t *phase_state = &state->phase[index];
     const flux_residual_phase_t *phase = &residual->phase[index];
     const bool remains = does_not_fall(residual, phase_state, phase);
     int side = 0;
     difference_t difference = AGREES;
-    if (residual->run && !residual->lost && !is_lost) {
+    if (residual->sample.run && !residual->lost && !is_lost) {
         difference = compare(residual, phase_state, index, &side);
         state->agreed |= (uint32_t)(difference == AGREES && !phase->small) << index;
         state->nearly |= (uint32_t)(difference == NEARLY) << index;
@@ -208,7 +210,7 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
     const bool more = phase->current_q9 > 2 * residual->offset_q9;
     check_excess(residual, phase_state, index, (phase->at_rest && more) || remains || (beyond && side < 0), evidence);
     const bool missing = is_missing(residual, phase_state, index);
-    evidence->missing |= (uint32_t)(residual->run && missing) << index;
+    evidence->missing |= (uint32_t)(residual->sample.run && missing) << index;
     evidence->suspicious |= (difference != AGREES && difference != NEARLY) || phase_state->excess_periods > 0 ||
                             (more && phase->off && phase->flux_q29 == 0);
 }
@@ -218,10 +220,9 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
  * nothing here, and may be the encoder's. A wrong angle shows most in a stroke that begins in its middle, as the first
  * one of a run, and may be within the tolerances in complete ones; a fault of the phase shows in the next stroke, too.
  */
-static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *state, uint32_t lost_phases,
-                         flux_evidence_t *evidence) {
+static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *state, flux_evidence_t *evidence) {
     if (state->doubted == 0) {
-        state->doubted_at = residual->periods;
+        state->doubted_at = residual->sample.periods;
         state->doubt_turned_q24 = 0;
         state->agreed = state->nearly = 0;
         return;
@@ -232,7 +233,7 @@ static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *stat
     const bool alone = (doubted & (doubted - 1u)) == 0;
     const int32_t quiet_q24 = fixed_abs(state->quiet_turned_q24);
     if (fixed_abs(state->doubt_turned_q24) < 1 << 24 ||
-        residual->periods - state->doubted_at < DOUBT_MS * residual->periods_per_ms ||
+        residual->sample.periods - state->doubted_at < DOUBT_MS * residual->sample.periods_per_ms ||
         (alone && quiet_q24 > AGAIN_Q24 && quiet_q24 < GONE_Q24)) {
         return;
     }
@@ -240,7 +241,7 @@ static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *stat
     const uint32_t agreed = state->agreed & ~state->nearly;
     state->agreed = state->nearly = 0;
     const uint32_t all = (1u << residual->phases) - 1u;
-    if (!alone || quiet_q24 >= GONE_Q24 || ((doubted | agreed | lost_phases) & all) != all) {
+    if (!alone || quiet_q24 >= GONE_Q24 || ((doubted | agreed | residual->sample.lost_phases) & all) != all) {
         return;
     }
     if (state->doubted_side > 0) {
@@ -259,13 +260,12 @@ void phase_evidence_forget(phase_evidence_t *state) {
     }
 }
 
-COLD void phase_evidence_step(phase_evidence_t *state, const flux_residual_t *residual, uint32_t lost_phases,
-                              flux_evidence_t *evidence) {
+COLD void phase_evidence_step(phase_evidence_t *state, const flux_residual_t *residual, flux_evidence_t *evidence) {
     for (unsigned phase = 0; phase < residual->phases; phase++) {
-        check_phase(residual, state, phase, (lost_phases >> phase & 1u) != 0, evidence);
+        check_phase(residual, state, phase, evidence);
     }
-    if (residual->run) {
-        judge_doubts(residual, state, lost_phases, evidence);
+    if (residual->sample.run) {
+        judge_doubts(residual, state, evidence);
     } else {
         state->doubted = 0;
     }

@@ -59,10 +59,9 @@ typedef struct {
     phase_evidence_phase_t phase[HAL_PHASES_MAX];
 } phase_evidence_t;
 
-/* Adds the evidence of a sample. lost_phases: bit of each phase that stays off (monitors/degraded.h): only a current in
- * it counts. [background] */
-void phase_evidence_step(phase_evidence_t *state, const flux_residual_t *residual, uint32_t lost_phases,
-                         flux_evidence_t *evidence);
+/* Adds the evidence of a sample. Of a phase that stays off (monitors/degraded.h) only a current in it counts.
+ * [background] */
+void phase_evidence_step(phase_evidence_t *state, const flux_residual_t *residual, flux_evidence_t *evidence);
 
 /* Forgets differences that have begun. [background] */
 void phase_evidence_forget(phase_evidence_t *state);

@@ -256,13 +256,13 @@ bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, 
 }
 
 uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
-                           const flux_sample_t *sample, const flux_monitor_motion_t *motion) {
-    (void)parameters, (void)monitor, (void)sample, (void)motion;
+                           const flux_sample_t *sample) {
+    (void)parameters, (void)monitor, (void)sample;
     return 0;
 }
 
-void flux_monitor_lose(flux_monitor_t *monitor, uint32_t phases) {
-    (void)monitor, (void)phases;
+void flux_monitor_forget(flux_monitor_t *monitor) {
+    (void)monitor;
 }
 
 bool degraded_accepts(const degraded_parameters_t *parameters, degraded_t *degraded, bool run, uint64_t failed,

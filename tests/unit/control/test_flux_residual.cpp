@@ -33,7 +33,7 @@ class FluxResidual : public testing::Test {
     void step() {
         input.periods++;
         ASSERT_TRUE(flux_residual_step(&residual, &input));
-        flux_residual_follow(&residual, &input, correction_q29);
+        flux_residual_follow(&residual, correction_q29);
     }
 
     void set(unsigned phase, double current_A, double flux_Wb) {

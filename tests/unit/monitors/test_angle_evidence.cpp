@@ -66,10 +66,13 @@ class AngleEvidence : public testing::Test {
     void monitor_step() {
         flux_residual_t residual{};
         residual.phases = PHASES;
-        residual.run = input.run;
-        residual.periods = input.period;
+        residual.sample.run = input.run;
+        residual.sample.encoder_angle = input.encoder_angle;
+        residual.sample.torque_q24 = input.torque_q24;
+        residual.sample.lost_phases = input.lost_phases;
+        residual.sample.periods = input.period;
         residual.elapsed = input.period - monitor.period;
-        residual.period_flux_q29 = input.flux_step_max_q29;
+        residual.sample.period_flux_q29 = input.flux_step_max_q29;
         residual.shortest_q29 =
             applied_flux_shortest_pulse_q29(input.flux_step_max_q29, machine_tables.minimum_pulse_ns, RATE_HZ / 1000u);
         for (unsigned k = 0; k < PHASES; k++) {
@@ -81,14 +84,12 @@ class AngleEvidence : public testing::Test {
             residual.phase[k].zero_at = input.zero_at[k];
             residual.phase[k].known = input.known[k];
         }
-        const angle_evidence_input_t encoder = {
-            .encoder_angle = input.encoder_angle, .torque_q24 = input.torque_q24, .lost_phases = input.lost_phases};
         if (residual.elapsed == 0) {
             return;
         }
         monitor.period = input.period;
         monitor.evidence = {};
-        angle_evidence_step(&parameters, &monitor.state, &residual, &encoder, &monitor.evidence);
+        angle_evidence_step(&parameters, &monitor.state, &residual, &monitor.evidence);
         monitor.frozen = flux_monitor_verdict(&monitor.evidence, 0) == FAULT_ENCODER;
         flux_evidence_t of_angle = monitor.evidence;
         of_angle.parted = false;

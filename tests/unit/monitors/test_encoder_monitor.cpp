@@ -24,20 +24,21 @@ class EncoderMonitor : public testing::Test {
         parameters.rate_hz = RATE_HZ;
         parameters.over_speed_q22 = to_fixed(rad_s(3600.0), Q22);
         parameters.travel = int32_t(3600.0 / 60.0 * PERIOD_S * 0x1p32);
-        input.period = 100;
-        encoder_monitor_step(&parameters, &monitor, &input);
+        input.periods = 100;
+        encoder_monitor_step(&parameters, &monitor, &residual);
     }
 
     // One period in which the encoder shows an angle, degrees.
     void step(double encoder_deg) {
-        input.period++;
+        input.periods++;
         input.encoder_angle = uint32_t(int64_t(encoder_deg * DEGREE)) & ~((1u << 15) - 1u);
-        encoder_monitor_step(&parameters, &monitor, &input);
+        encoder_monitor_step(&parameters, &monitor, &residual);
     }
 
     encoder_monitor_parameters_t parameters{};
     encoder_monitor_t monitor{};
-    encoder_monitor_input_t input{};
+    flux_residual_t residual{};
+    flux_sample_t &input = residual.sample;
 };
 
 TEST_F(EncoderMonitor,
@@ -65,7 +66,7 @@ TEST_F(EncoderMonitor,
         for (int k = 0; k < 20 * RATE_HZ / 1000; k++) {
             const bool gap = k == 10 * RATE_HZ / 1000;
             angle_deg += 1800.0 / RATE_HZ + (gap ? 270.0 : 0.0);
-            input.lost = gap && lost;
+            residual.lost = gap && lost;
             step(angle_deg);
         }
         EXPECT_EQ(monitor.turned_round, !lost);
@@ -74,7 +75,7 @@ TEST_F(EncoderMonitor,
 
 TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_turn_round) {
     monitor = {};
-    input.period = 0;
+    input.periods = 0;
     for (int k = 0; k < 10 * RATE_HZ / 1000; k++) {
         const double angle_deg = 90.0 - k * 1800.0 / RATE_HZ;
         step(angle_deg);
@@ -131,7 +132,7 @@ TEST_F(EncoderMonitor, over_speed_of_the_fastest_machine_is_found_at_100_khz_and
                 bool failed = false;
                 for (int k = 0; k < 200; k += spacing) {
                     step(sign * part * LIMIT_RPM * 6.0 * FAST_PERIOD_S * k);
-                    input.period += uint32_t(spacing) - 1u;
+                    input.periods += uint32_t(spacing) - 1u;
                     failed = failed || monitor.over_speed;
                 }
                 EXPECT_EQ(failed, fails) << sign * part << " " << spacing;

@@ -17,10 +17,10 @@ constexpr uint32_t PERIODS_PER_REVOLUTION = 1000; // 25 ms at 40 kHz
 class PhaseBalance : public testing::Test {
   protected:
     void SetUp() override {
-        residual.run = true;
+        residual.sample.run = true;
         residual.phases = 3;
         residual.elapsed = 1;
-        residual.periods_per_ms = 40;
+        residual.sample.periods_per_ms = 40;
     }
 
     uint32_t verdict(const flux_evidence_t &evidence) const {
@@ -41,14 +41,13 @@ class PhaseBalance : public testing::Test {
                 one.voltage_q29 = int32_t(TABLE_Q29 * ratio[phase]);
             }
             evidence = {};
-            phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, lost, &evidence);
+            phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, &evidence);
         }
         return verdict(evidence);
     }
 
     phase_balance_t balance{};
     flux_residual_t residual{};
-    uint32_t lost = 0;
     unsigned silent = HAL_PHASES_MAX; // phase without current
     unsigned brief = HAL_PHASES_MAX;  // phase that conducts for a sixteenth of its third
     double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
@@ -119,7 +118,7 @@ TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_thr
     residual.phases = 4;
     for (const unsigned absent : {0u, 2u, 3u}) {
         silent = absent;
-        lost = 1u << absent;
+        residual.sample.lost_phases = 1u << absent;
         for (const auto &[wrong, failed] :
              {std::pair{1.36, FAULT_BIT(FAULT_CURRENT_SENSOR)}, std::pair{0.73, FAULT_BIT(FAULT_CURRENT_SENSOR)},
               std::pair{1.3, uint64_t(0)}}) {
@@ -134,7 +133,7 @@ TEST_F(PhaseBalance, without_a_lost_phase_the_others_are_judged_if_there_are_thr
 
 TEST_F(PhaseBalance, of_two_phases_that_are_left_neither_is_accused_of_a_difference_but_the_encoder_of_what_both_have) {
     silent = 1;
-    lost = 2u;
+    residual.sample.lost_phases = 2u;
     for (const double wrong : {3.0, 0.4}) {
         ratio[2] = wrong;
         EXPECT_EQ(window(), 0u) << wrong;
@@ -152,9 +151,9 @@ TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {
     ASSERT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
     ratio[1] = 1.0;
     EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
-    residual.run = false;
+    residual.sample.run = false;
     flux_evidence_t evidence{};
-    phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, lost, &evidence);
+    phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, &evidence);
     EXPECT_EQ(verdict(evidence), 0u);
 }
 

@@ -37,8 +37,8 @@ class PhaseEvidence : public testing::Test {
 
     uint32_t step() {
         input.periods++;
-        const uint32_t failed_now = flux_monitor_step(&parameters, &monitor, &input, &motion);
-        flux_residual_follow(&monitor.residual, &input, correction_q29);
+        const uint32_t failed_now = flux_monitor_step(&parameters, &monitor, &input);
+        flux_residual_follow(&monitor.residual, correction_q29);
         return failed_now;
     }
 
@@ -64,7 +64,6 @@ class PhaseEvidence : public testing::Test {
     }
 
     flux_monitor_parameters_t parameters{};
-    flux_monitor_motion_t motion{};
     flux_monitor_t monitor{};
     flux_sample_t input{};
     int32_t correction_q29[HAL_PHASES_MAX] = {};
@@ -167,7 +166,7 @@ TEST_F(PhaseEvidence, currents_that_the_voltage_ends_between_samples_are_no_corr
         input.next_q29[1] = ends ? 0 : int32_t(20e-3 * Q29);
         ASSERT_EQ(step(), 0u) << k;
         most_Wb = std::max(most_Wb, std::fabs(monitor.residual.phase[1].followed_q29 / Q29));
-        ASSERT_LE(monitor.residual.periods - monitor.residual.phase[1].zero_at, 4u) << k;
+        ASSERT_LE(monitor.residual.sample.periods - monitor.residual.phase[1].zero_at, 4u) << k;
     }
     EXPECT_LT(most_Wb, 1e-3);
     // The duty that still acts drives it further: the integral goes on.
@@ -258,8 +257,8 @@ TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
     set(0, 10.0, 0.1);
     step();
     EXPECT_NE(correction_q29[0], 0);
-    EXPECT_EQ(flux_monitor_step(&parameters, &monitor, &input, &motion), 0u);
-    flux_residual_follow(&monitor.residual, &input, correction_q29);
+    EXPECT_EQ(flux_monitor_step(&parameters, &monitor, &input), 0u);
+    flux_residual_follow(&monitor.residual, correction_q29);
     EXPECT_EQ(correction_q29[0], 0);
 }
 
