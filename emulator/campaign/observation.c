@@ -90,18 +90,18 @@ static bool is_present(const observation_t *seen, unsigned i) {
 }
 
 static void look_at_events(observation_t *seen) {
-    memset(seen->present, 0, sizeof seen->present);
     seen->disturbed = seen->ever_disturbed & DISTURBS_MEMORY ? seen->disturbed & (DISTURBS_MEMORY | DISTURBS_STATE) : 0;
+    for (unsigned kind = 1; kind < FAULT_COUNT; kind++) {
+        const uint64_t ended_ns = seen->ended_ns[kind];
+        seen->present[kind] = seen->active[kind] || (ended_ns != 0 && seen->time_ns < ended_ns + OBSERVATION_AFTER_NS);
+        seen->disturbed |= seen->present[kind] ? fault_effect(kind).disturbs : 0;
+    }
     seen->variables = 0;
     seen->second_sender = seen->hostile_sender = false;
     for (unsigned i = 0; i < seen->world->events; i++) {
         const world_event_t *event = &seen->world->event[i];
         if (!is_present(seen, i)) {
             continue;
-        }
-        if (event->kind == WORLD_FAULT) {
-            seen->present[event->what] = true;
-            seen->disturbed |= fault_effect(event->what).disturbs;
         }
         seen->variables |= event->kind == WORLD_SET ? variable_effect(event->what).disturbs : 0;
         seen->second_sender = seen->second_sender || event->kind == WORLD_SECOND;
@@ -391,7 +391,13 @@ void observation_on_frame(observation_t *seen, uint64_t time_ns, unsigned identi
 
 void observation_on_fault(observation_t *seen, unsigned kind, bool begins) {
     seen->time_ns = seen->fault_ns = seen->plant->time_ns;
-    if (begins && kind < FAULT_COUNT) {
+    if (kind >= FAULT_COUNT) {
+        return;
+    }
+    seen->active[kind] = begins;
+    if (!begins) {
+        seen->ended_ns[kind] = seen->time_ns;
+    } else {
         seen->injected[kind] = true;
         seen->ever_disturbed |= fault_effect(kind).disturbs;
         seen->disturbed |= fault_effect(kind).disturbs;

@@ -132,6 +132,8 @@ typedef struct {
     uint64_t fault_ns;                    /* the last fault began or ended */
 
     /* Present, or ended less than OBSERVATION_AFTER_NS ago; updated each millisecond. */
+    bool active[OBSERVATION_KINDS_MAX];
+    uint64_t ended_ns[OBSERVATION_KINDS_MAX]; /* 0: not yet */
     bool present[OBSERVATION_KINDS_MAX];
     uint32_t disturbed; /* by faults, DISTURBS_*; memory that has changed stays so */
     uint32_t variables; /* by bench variables, VARIABLE_* */
