@@ -124,8 +124,8 @@ uint32_t slow_counts_uncertain_angle(const slow_counts_parameters_t *parameters,
     return (parameters->count >> 10) * fixed_min_u32(ratio_q8, UNCERTAIN_MAX_Q8);
 }
 
-NOINLINE uint32_t slow_counts_angle(const slow_counts_results_t *results, const load_observer_t *observer,
-                                    uint32_t encoder_angle, unsigned encoder_shift) {
+uint32_t slow_counts_angle(const slow_counts_results_t *results, const load_observer_t *observer,
+                           uint32_t encoder_angle, unsigned encoder_shift) {
     const int32_t change = (int32_t)(encoder_angle - results->encoder_angle);
     const int32_t last = (int32_t)((1u << encoder_shift) - 1u);
     if (change != 0) {

@@ -40,8 +40,8 @@ NOINLINE void observe_recover(control_state_t *state, uint32_t periods_per_ms) {
 }
 
 /* Counts that become fast again are followed at the steady bandwidth, until one triggers. */
-NOINLINE static const load_observer_gains_t *slow_gains(const control_parameters_t *parameters, control_state_t *state,
-                                                        const slow_counts_results_t *slow_counts) {
+static const load_observer_gains_t *slow_gains(const control_parameters_t *parameters, control_state_t *state,
+                                               const slow_counts_results_t *slow_counts) {
     state->bandwidth.stage = OBSERVER_BANDWIDTH_STEADY_STAGE;
     const uint32_t encoder_angle = state->measurement.encoder_angle;
     if (encoder_angle == slow_counts->encoder_angle) {
