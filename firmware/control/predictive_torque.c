@@ -277,7 +277,9 @@ static inline int32_t drop_plan(plan_t *p, int32_t shortfall) {
     return fixed_add(shortfall, torque);
 }
 
-void predictive_torque_reset(predictive_torque_t *control) {
+/* Not in its caller, whose prologue shared a block with it on RV32: the computed bounds of the laws without predictive
+ * control then had the 1,000 instructions of clearing its state. */
+NOINLINE void predictive_torque_reset(predictive_torque_t *control) {
     *control = (predictive_torque_t){.torque_shortfall_q24 = 0};
 }
 
