@@ -29,12 +29,20 @@
 
 #define DELTA (FLUX_ANGLE_COURSES - 2)
 
-static int32_t flux_at(const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
-    return phase_map_flux_q29(tables, phase_map_distance(angle), current_q9);
+/* 0.5 rad/s: at a lower speed the errors of the voltage are many times the flux linkage. */
+#define SPEED_MIN_Q22 (1u << 21)
+
+/* Part of the sensors' range above which a current counts. */
+#define CURRENT_PART 64
+
+static int32_t flux_at(uint32_t angle, int32_t current_q9) {
+    return phase_map_flux_q29(&machine_tables, phase_map_distance(angle), current_q9);
 }
 
-COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *tables, const flux_angle_sample_t *sample) {
-    if (sample->flux_q29 <= 0) {
+COLD bool flux_angle_add(flux_angle_t *flux_angle, const flux_residual_t *residual, unsigned index) {
+    const flux_residual_phase_t *phase = &residual->phase[index];
+    const int32_t flux_q29 = phase->voltage_q29, current_q9 = phase->current_q9;
+    if (flux_q29 <= 0) {
         flux_angle->resistive_q29 = flux_angle->time_q29 = 0;
         if (flux_angle->conduction_samples > 0) {
             flux_angle->last_conduction_samples = flux_angle->conduction_samples;
@@ -42,20 +50,23 @@ COLD bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *table
         flux_angle->conduction_samples = 0;
         return false;
     }
-    flux_angle->resistive_q29 = fixed_add(flux_angle->resistive_q29, sample->resistive_q29);
-    flux_angle->time_q29 = fixed_add(flux_angle->time_q29, sample->time_q29);
-    if (!sample->counts) {
+    /* After more than 255 periods the integrals are wrong until the phase begins again. */
+    const int32_t time_q29 = (residual->sample.period_flux_q29 >> 8) * (int32_t)(residual->elapsed & 0xffu);
+    flux_angle->resistive_q29 = fixed_add(flux_angle->resistive_q29, phase->step_drop_q29);
+    flux_angle->time_q29 = fixed_add(flux_angle->time_q29, time_q29);
+    if (!phase->known || phase->off || current_q9 <= machine_tables.current_range_q9 / CURRENT_PART ||
+        fixed_magnitude(residual->sample.speed_q22) <= SPEED_MIN_Q22) {
         return false;
     }
-    const int32_t slope_q29 = flux_at(tables, sample->angle + HALF_STEP, sample->current_q9) -
-                              flux_at(tables, sample->angle - HALF_STEP, sample->current_q9);
-    const int32_t excess_q29 = fixed_subtract(sample->table_q29, sample->flux_q29);
+    const int32_t slope_q29 =
+        flux_at(phase->angle + HALF_STEP, current_q9) - flux_at(phase->angle - HALF_STEP, current_q9);
+    const int32_t excess_q29 = fixed_subtract(phase->table_q29, flux_q29);
     const int32_t course[FLUX_ANGLE_COURSES] = {
         flux_angle->time_q29 >> COARSER,
         flux_angle->resistive_q29 >> COARSER,
-        sample->table_q29 >> COARSER,
+        phase->table_q29 >> COARSER,
         slope_q29 >> SLOPE_COARSER,
-        fixed_add(excess_q29, fixed_multiply_shift(slope_q29, sample->misalignment, STEP_BITS)) >> COARSER,
+        fixed_add(excess_q29, fixed_multiply_shift(slope_q29, phase->misalignment, STEP_BITS)) >> COARSER,
     };
     for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
         for (unsigned column = row; column < FLUX_ANGLE_COURSES; column++) {

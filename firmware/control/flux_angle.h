@@ -1,6 +1,6 @@
 /* Misalignment by flux linkage: the angle that the encoder is off by, from the phases alone, whatever the load does.
  *
- * The flux linkage that the voltage has built up in a phase (applied_flux.h) differs from that of the tables at the
+ * The flux linkage that the voltage has built up in a phase (flux_residual.h) differs from that of the tables at the
  * measured current and angle, psi, by
  *
  *   psi - psi(voltage) = delta D + a psi + b (integral of R i) + c t,   D = psi(angle + s / 2) - psi(angle - s / 2)
@@ -20,7 +20,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "control/machine_tables.h"
+#include "control/flux_residual.h"
 #include "hal.h"
 
 /* Of c, b, a and delta, in the order of elimination, and of the left side. */
@@ -35,19 +35,9 @@ typedef struct {
     int32_t time_q29;                                     /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
 } flux_angle_t;
 
-typedef struct {
-    uint32_t angle;        /* at which psi was taken, 2^-32 electrical rev */
-    int32_t misalignment;  /* that was subtracted for it, 2^-32 electrical rev */
-    int32_t current_q9;    /* A, Q7.9 */
-    int32_t flux_q29;      /* by the voltage since the phase was without current, Wb, Q2.29 */
-    int32_t table_q29;     /* psi, Wb, Q2.29 */
-    int32_t resistive_q29; /* R i times the time since the last sample, Wb, Q2.29 */
-    int32_t time_q29;      /* 1/256 of the DC-link voltage times that time, Wb, Q2.29 */
-    bool counts;           /* psi(voltage) is known, there is current, and the switches are not off */
-} flux_angle_sample_t;
-
-/* One sample; true when the sums are to be solved. [background] */
-bool flux_angle_add(flux_angle_t *flux_angle, const machine_tables_t *tables, const flux_angle_sample_t *sample);
+/* A sample of a phase, which counts while the rotor turns and the phase conducts at a known psi(voltage); true when the
+ * sums are to be solved. [background] */
+bool flux_angle_add(flux_angle_t *flux_angle, const flux_residual_t *residual, unsigned index);
 
 /* Misalignment, 2^-32 electrical rev; 0 when the samples do not tell it from the other errors, or are those of a part
  * of a conduction. [background] */

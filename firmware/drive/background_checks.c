@@ -61,33 +61,16 @@ COLD static bool read_sample(const control_state_t *control, const control_param
     return false;
 }
 
-/* 0.5 rad/s: at a lower speed the errors of the voltage are many times the flux linkage. */
-#define FLUX_ANGLE_SPEED_MIN_Q22 (1u << 21)
-
 /* Misalignment of the phases by their flux linkage. */
 static void follow_misalignment(drive_t *drive) {
     const flux_residual_t *residual = &drive->flux.residual;
-    const bool turns = fixed_magnitude(residual->sample.speed_q22) > FLUX_ANGLE_SPEED_MIN_Q22;
-    const int32_t periods =
-        (int32_t)(residual->elapsed & 0xffu); /* after more the integrals are wrong until the phase begins again */
-    for (unsigned index = 0; index < machine_tables.phases; index++) {
-        flux_angle_t *flux_angle = &drive->flux_angle[index];
-        const flux_residual_phase_t *phase = &residual->phase[index];
-        const flux_angle_sample_t sample = {
-            .angle = phase->angle,
-            .misalignment = phase->misalignment,
-            .current_q9 = phase->current_q9,
-            .flux_q29 = phase->voltage_q29,
-            .table_q29 = phase->table_q29,
-            .resistive_q29 = phase->step_drop_q29,
-            .time_q29 = (residual->sample.period_flux_q29 >> 8) * periods,
-            .counts = turns && phase->known && !phase->off && phase->current_q9 > machine_tables.current_range_q9 / 64,
-        };
+    for (unsigned phase = 0; phase < residual->phases; phase++) {
+        flux_angle_t *flux_angle = &drive->flux_angle[phase];
         if (!residual->sample.run) {
             *flux_angle = (flux_angle_t){0};
-            drive->control.flux_misalignment[index] = 0;
-        } else if (flux_angle_add(flux_angle, &machine_tables, &sample)) {
-            drive->control.flux_misalignment[index] = flux_angle_solve(flux_angle);
+            drive->control.flux_misalignment[phase] = 0;
+        } else if (flux_angle_add(flux_angle, residual, phase)) {
+            drive->control.flux_misalignment[phase] = flux_angle_solve(flux_angle);
         }
     }
 }

@@ -37,8 +37,7 @@ class FluxAngle : public testing::Test {
             const double measured = 0.52 + rpm / 60.0 * machine_tables.rotor_poles * since_s;
             if (measured > 0.9) {
                 since_s = drift_Wb = 0.0;
-                flux_angle_sample_t off = {};
-                flux_angle_add(&state, &machine_tables, &off);
+                add({});
                 continue;
             }
             since_s += SAMPLE_S;
@@ -46,26 +45,36 @@ class FluxAngle : public testing::Test {
             const double true_rev = measured - misalignment_deg / 360.0 * machine_tables.rotor_poles;
             drift_Wb += (RESISTANCE_OHM * (resistance_gain - 1.0) * current_A + drop_V) * SAMPLE_S;
             const double corrected = measured - learned_deg / 360.0 * machine_tables.rotor_poles;
-            const flux_angle_sample_t sample = {
-                .angle = uint32_t(int64_t(std::floor(corrected * REV))),
-                .misalignment = to_fixed(learned_deg / 360.0 * machine_tables.rotor_poles, REV),
-                .current_q9 = to_fixed(current_A, 512.0),
-                .flux_q29 = to_fixed(flux_gain * psi_Wb(true_rev, current_A) + drift_Wb, Q29),
-                .table_q29 = to_fixed(psi_Wb(corrected, current_A), Q29),
-                .resistive_q29 = to_fixed(RESISTANCE_OHM * current_A * SAMPLE_S, Q29),
-                .time_q29 = to_fixed(VOLTAGE_V / 256.0 * SAMPLE_S, Q29),
-                .counts = true,
-            };
-            if (flux_angle_add(&state, &machine_tables, &sample)) {
+            flux_residual_phase_t sample = {};
+            sample.angle = uint32_t(int64_t(std::floor(corrected * REV)));
+            sample.misalignment = to_fixed(learned_deg / 360.0 * machine_tables.rotor_poles, REV);
+            sample.current_q9 = to_fixed(current_A, 512.0);
+            sample.voltage_q29 = to_fixed(flux_gain * psi_Wb(true_rev, current_A) + drift_Wb, Q29);
+            sample.table_q29 = to_fixed(psi_Wb(corrected, current_A), Q29);
+            sample.step_drop_q29 = to_fixed(RESISTANCE_OHM * current_A * SAMPLE_S, Q29);
+            if (add(sample)) {
                 solved_deg = flux_angle_solve(&state) / REV / machine_tables.rotor_poles * 360.0;
                 solutions++;
             }
         }
     }
 
+    // A sample of a phase that conducts, its voltage known, on a rotor that turns.
+    bool add(const flux_residual_phase_t &sample) {
+        flux_residual_t residual{};
+        residual.sample.speed_q22 = 1 << 24;
+        residual.sample.period_flux_q29 = period_flux_q29;
+        residual.elapsed = elapsed;
+        residual.phase[0] = sample;
+        residual.phase[0].known = true;
+        return flux_angle_add(&state, &residual, 0);
+    }
+
     double load_Nm(double time_s) const { return 12.0 + moving_A * std::sin(2.0 * PI * 37.0 * time_s); }
 
     flux_angle_t state{};
+    int32_t period_flux_q29 = to_fixed(VOLTAGE_V * SAMPLE_S / 4.0, Q29);
+    uint32_t elapsed = 4;
     double rpm = 150.0;
     double misalignment_deg = 0.0, learned_deg = 0.0;
     double flux_gain = 1.0, resistance_gain = 1.0, drop_V = 0.0, moving_A = 0.0;
@@ -119,38 +128,54 @@ TEST_F(FluxAngle, is_unknown_while_a_conduction_lasts_longer_than_it_is_remember
 }
 
 TEST_F(FluxAngle, is_unknown_without_a_course_of_its_own) {
+    period_flux_q29 = 0;
     for (int k = 0; k < 4096; k++) {
-        const flux_angle_sample_t constant = {
-            .angle = 0xb0000000u,
-            .misalignment = 0,
-            .current_q9 = 10 * 512,
-            .flux_q29 = k % 1000 == 0 ? 0 : 1 << 26,
-            .table_q29 = 1 << 25,
-            .resistive_q29 = 0,
-            .time_q29 = 0,
-            .counts = true,
-        };
-        flux_angle_add(&state, &machine_tables, &constant);
+        flux_residual_phase_t constant = {};
+        constant.angle = 0xb0000000u;
+        constant.current_q9 = 10 * 512;
+        constant.voltage_q29 = k % 1000 == 0 ? 0 : 1 << 26;
+        constant.table_q29 = 1 << 25;
+        add(constant);
     }
     EXPECT_EQ(flux_angle_solve(&state), 0);
 }
 
+// Without each of what a sample needs: a rotor that turns, a known integral, switches that are on, a current.
+TEST_F(FluxAngle, samples_that_show_no_angle_are_not_counted) {
+    const auto samples = [&](auto change) {
+        flux_residual_t residual{};
+        residual.elapsed = 4;
+        residual.sample.speed_q22 = 1 << 24;
+        residual.phase[0].known = true;
+        residual.phase[0].voltage_q29 = residual.phase[0].table_q29 = 1 << 26;
+        residual.phase[0].current_q9 = 10 * 512;
+        change(residual);
+        state = {};
+        flux_angle_add(&state, &residual, 0);
+        return state.samples;
+    };
+    EXPECT_EQ(samples([](flux_residual_t &) {}), 1u);
+    EXPECT_EQ(samples([](flux_residual_t &residual) { residual.sample.speed_q22 = 1 << 21; }), 0u);
+    EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].known = false; }), 0u);
+    EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].off = true; }), 0u);
+    EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].current_q9 = 512; }), 0u);
+}
+
 TEST_F(FluxAngle, overflows_nothing) {
+    period_flux_q29 = INT32_MAX;
+    elapsed = 255;
     for (const int32_t sign : {1, -1}) {
         state = {};
         for (uint32_t k = 0; k < 20000; k++) {
             const bool end = k % 100 == 0;
-            const flux_angle_sample_t sample = {
-                .angle = 0x80000000u + k * 0x01234567u,
-                .misalignment = sign * (1 << 29),
-                .current_q9 = 79 * 512,
-                .flux_q29 = end ? 0 : INT32_MAX,
-                .table_q29 = k % 2 == 0 ? INT32_MAX : 0,
-                .resistive_q29 = INT32_MAX / 2,
-                .time_q29 = INT32_MAX,
-                .counts = true,
-            };
-            if (flux_angle_add(&state, &machine_tables, &sample)) {
+            flux_residual_phase_t sample = {};
+            sample.angle = 0x80000000u + k * 0x01234567u;
+            sample.misalignment = sign * (1 << 29);
+            sample.current_q9 = 79 * 512;
+            sample.voltage_q29 = end ? 0 : INT32_MAX;
+            sample.table_q29 = k % 2 == 0 ? INT32_MAX : 0;
+            sample.step_drop_q29 = INT32_MAX / 2;
+            if (add(sample)) {
                 flux_angle_solve(&state);
             }
         }
