@@ -211,6 +211,7 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
                (drive->command.request == COMMAND_CLEAR_FAULT || !parameters->allowed)) {
         drive->degraded.lost = 0;
         drive->control.lost_phase = 0;
+        flux_monitor_forget(&drive->flux);
     }
     degraded_step(parameters, &drive->degraded, &machine_tables);
     return failed;

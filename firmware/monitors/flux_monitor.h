@@ -40,7 +40,7 @@ fault_t flux_monitor_verdict(const flux_evidence_t *evidence, uint32_t phases);
 uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
                            const flux_sample_t *sample);
 
-/* Forgets the failed checks of a run that goes on without the phases that have caused them. [background] */
+/* Forgets failed checks and what has begun, when a phase is lost or given back (monitors/degraded.h). [background] */
 void flux_monitor_forget(flux_monitor_t *monitor);
 
 #endif
