@@ -122,15 +122,13 @@ static bool does_not_fall(const flux_residual_t *residual, phase_evidence_phase_
 
 /* True when the integral has gone only because the tables have taken most of it away, more than a warm winding and the
  * drops of the devices explain, a seventh of the error of the voltage, twice that after a small current: by voltage and
- * time alone the current may flow, and it is the angle of the tables that is wrong. At most all of it: what is more has
- * added up in a long stroke. */
+ * time alone the current may flow, and it is the angle of the tables that is wrong. */
 static bool taken_away(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
     const uint32_t age = residual->sample.periods - phase->zero_at;
     const bool was_small = phase->conducting > FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms;
     const int64_t drops_q29 = (int64_t)(error_q29(residual) / 7 * (was_small ? 2 : 1)) * age;
-    const int64_t taken_q29 = -(int64_t)phase->followed_q29;
     const int32_t warm_q29 = applied_flux_warm_q29(&machine_tables, phase->drop_q29);
-    return taken_q29 > phase->peak_q29 / 2 + drops_q29 + warm_q29 && taken_q29 < 2 * (int64_t)phase->peak_q29;
+    return -(int64_t)phase->followed_q29 > phase->peak_q29 / 2 + drops_q29 + warm_q29;
 }
 
 /* A current that should not be: does it move? */
