@@ -10,8 +10,8 @@ typedef struct {
     /* By each phase (phase_evidence.h): */
     uint32_t too_little;                             /* less current than the voltage must have caused, at any angle */
     uint32_t too_little_at_angle, too_much_at_angle; /* in one phase alone, at the measured angle */
-    uint32_t missing; /* a current that is less, none or has ended; judged less strictly */
-    uint32_t excess;  /* a current that should not be, however short; the next three are of one that lasts: */
+    uint32_t missing;                                /* voltage without current, or one that has ended too soon */
+    uint32_t excess; /* a current that should not be, however short; the next three are of one that lasts: */
     uint32_t excess_moves;
     uint32_t excess_still;
     uint32_t excess_by_tables; /* there is one only because the tables have emptied the integral */

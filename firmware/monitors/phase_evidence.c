@@ -163,8 +163,8 @@ static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t
     evidence->excess_still |= (uint32_t)still << index;
 }
 
-/* A current is less than at the measured angle, or none while there is voltage, or ended within the last milliseconds
- * before the voltage had removed it. */
+/* There is no current while there is voltage, or it has ended within the last milliseconds before the voltage had
+ * removed it. */
 static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *state, unsigned index) {
     const flux_residual_phase_t *phase = &residual->phase[index];
     if (phase->none && phase->flux_q29 > fixed_add(phase->peak_q29 / 8, 2 * residual->delay_q29)) {
@@ -173,10 +173,9 @@ static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *
     }
     const bool vanished = state->vanished &&
                           residual->sample.periods - state->vanished_at < VANISHED_MS * residual->sample.periods_per_ms;
-    const bool less = flux_residual_least_q29(residual, index) > fixed_add(phase->table_q29, phase->table_q29 / 4);
     const bool none =
         !phase->off && phase->current_q9 <= residual->offset_q9 && phase->flux_q29 > residual->delay_q29 / 2;
-    return vanished || less || none;
+    return vanished || none;
 }
 
 static void check_phase(const flux_residual_t *residual, phase_evidence_t *state, unsigned index,

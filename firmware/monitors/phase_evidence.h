@@ -11,8 +11,8 @@
  *                     the next stroke, in one phase alone while all others agree within half of the tolerances; a
  *                     second phase within an electrical revolution and 20 ms makes it the encoder's, or what all
  *                     sensors have in common
- *   missing           psi above the tables' by a quarter, voltage without current, or a current that has ended within
- *                     the last 2 ms before the voltage had removed it
+ *   missing           voltage without current, or a current that has ended within the last 2 ms before the voltage had
+ *                     removed it
  *
  * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical, and those of
  * flux_residual.h. At a current of up to 4/128 of its range, a small one, too_little counts only what more than this
