@@ -139,9 +139,6 @@ static bool is_old(const common_t *common, const flux_residual_phase_t *phase) {
 /* False when no angle at all explains the integral at the measured current, by the tolerances of contradicts(): then
  * the phase, its sensor or the voltage is at fault, not the encoder. */
 static bool fits_an_angle(const common_t *common, const flux_residual_phase_t *phase) {
-    if (is_old(common, phase)) {
-        return true;
-    }
     const flux_band_t band = band_of(phase, 0, HALF_REV, CURRENT_ERROR_Q9);
     const int32_t least_q29 = band.least_q29 - (band.least_q29 >> GAIN_SHIFT);
     const int32_t most_q29 = fixed_add(band.most_q29, band.most_q29 >> GAIN_SHIFT);
@@ -212,8 +209,7 @@ static bool has_moved(const common_t *common, angle_evidence_phase_t *state, con
         refer(common, state, phase, excess_q29, table_q29);
         return false;
     }
-    const bool parted = change_q29 > tolerance_q29 && fits_an_angle(common, phase);
-    state->moved = parted ? state->moved + periods : 0;
+    state->moved = change_q29 > tolerance_q29 ? state->moved + periods : 0;
     const int32_t part_q15 = (int32_t)(((periods < leak_periods ? periods : leak_periods) << 15) / leak_periods);
     state->excess_q29 = leak(state->excess_q29, excess_q29, part_q15);
     state->table_q29 = leak(state->table_q29, table_q29, part_q15);
