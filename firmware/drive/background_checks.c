@@ -244,7 +244,7 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
 COLD void background_checks(drive_t *drive, uint32_t time_us) {
     follow_heat(drive, time_us);
     test_itself(drive, time_us);
-    const bool suspicious = drive->flux.evidence.suspicious || drive->conduction_ends;
+    const bool suspicious = drive->flux.suspicious || drive->conduction_ends;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
     if (unmasked_read_periods(&drive->control.deferred_request) - drive->flux.residual.sample.periods >= spacing) {
         check(drive, time_us);

@@ -43,18 +43,18 @@ void flux_monitor_forget(flux_monitor_t *monitor) {
 COLD uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
                                 const flux_sample_t *sample) {
     flux_residual_t *residual = &monitor->residual;
-    flux_evidence_t *evidence = &monitor->evidence;
     const bool begins = sample->run && !residual->sample.run;
     if (!flux_residual_step(residual, sample)) {
         return monitor->failed;
     }
     encoder_monitor_step(&parameters->encoder, &monitor->encoder, residual);
-    *evidence = (flux_evidence_t){.turned_round = monitor->encoder.turned_round};
-    angle_evidence_step(&parameters->angle, &monitor->angle, residual, evidence);
-    phase_evidence_step(&monitor->phases_by_current, residual, evidence);
-    phase_balance_step(&monitor->balance, residual, parameters->least_q8, evidence);
-    monitor->phases = (begins ? 0 : monitor->phases) | failed_phases(evidence);
-    const uint32_t failed = (uint32_t)FAULT_BIT(flux_monitor_verdict(evidence, monitor->phases)) & ~1u;
+    flux_evidence_t evidence = {.turned_round = monitor->encoder.turned_round};
+    angle_evidence_step(&parameters->angle, &monitor->angle, residual, &evidence);
+    phase_evidence_step(&monitor->phases_by_current, residual, &evidence);
+    phase_balance_step(&monitor->balance, residual, parameters->least_q8, &evidence);
+    monitor->suspicious = evidence.suspicious;
+    monitor->phases = (begins ? 0 : monitor->phases) | failed_phases(&evidence);
+    const uint32_t failed = (uint32_t)FAULT_BIT(flux_monitor_verdict(&evidence, monitor->phases)) & ~1u;
     monitor->failed = sample->run ? monitor->failed | failed : failed;
     return monitor->failed;
 }

@@ -26,9 +26,9 @@ typedef struct {
     angle_evidence_t angle;
     phase_balance_t balance;
     encoder_monitor_t encoder;
-    flux_evidence_t evidence; /* of the last sample */
-    uint32_t failed;          /* FAULT_BITs of the verdicts, of a run until its end */
-    uint32_t phases;          /* bit of each phase with evidence of a fault since the last run began */
+    bool suspicious; /* a condition begins or nearly holds in the last sample: samples without delay decide */
+    uint32_t failed; /* FAULT_BITs of the verdicts, of a run until its end */
+    uint32_t phases; /* bit of each phase with evidence of a fault since the last run began */
 } flux_monitor_t;
 
 /* The fault that the evidence shows, FAULT_NONE without one. phases: bit of each phase with evidence of a fault in this

@@ -27,5 +27,5 @@ def documented() -> list[tuple[str, str]]:
     return re.findall(r"^\| (.+) \| `(\w+)` \|$", section, flags=re.MULTILINE)
 
 
-def test_the_table_of_the_page_is_the_compiled_one():
+def test_the_table_of_the_page_is_the_compiled_one() -> None:
     assert documented() == compiled()
