@@ -33,7 +33,6 @@
 typedef enum {
     AGREES,
     DOUBTFUL,      /* agrees within the tolerances, with hardly a current */
-    NEARLY,        /* agrees within them, but not within half of them */
     WITHIN_ANGLES, /* differs at the measured angle */
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
@@ -94,11 +93,7 @@ static difference_t compare(const flux_residual_t *residual, phase_evidence_phas
         const flux_band_t anywhere = tolerated(residual, 0, HALF_REV, phase->current_q9, 0);
         return low_q29 < anywhere.least_q29 ? BEYOND_ANGLES : WITHIN_ANGLES;
     }
-    if (phase->small) {
-        return high_q29 > table_q29 ? DOUBTFUL : AGREES;
-    }
-    return high_q29 > table_q29 / 2 + here.most_q29 / 2 || low_q29 < table_q29 / 2 + here.least_q29 / 2 ? NEARLY
-                                                                                                        : AGREES;
+    return phase->small && high_q29 > table_q29 ? DOUBTFUL : AGREES;
 }
 
 /* True when the opposite voltage has removed a quarter of the flux linkage since the switches opened, and the tables
@@ -189,7 +184,6 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
     if (residual->sample.run && !residual->lost && !is_lost) {
         difference = compare(residual, phase_state, index, &side);
         state->agreed |= (uint32_t)(difference == AGREES && !phase->small) << index;
-        state->nearly |= (uint32_t)(difference == NEARLY) << index;
     }
     const bool beyond = difference == BEYOND_ANGLES;
     phase_state->turned = side == 0 || side != phase_state->side
@@ -208,20 +202,20 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
     check_excess(residual, phase_state, index, (phase->at_rest && more) || remains || (beyond && side < 0), evidence);
     const bool missing = is_missing(residual, phase_state, index);
     evidence->missing |= (uint32_t)(residual->sample.run && missing) << index;
-    evidence->suspicious |= (difference != AGREES && difference != NEARLY) || phase_state->excess_periods > 0 ||
-                            (more && phase->off && phase->flux_q29 == 0);
+    evidence->suspicious |=
+        difference != AGREES || phase_state->excess_periods > 0 || (more && phase->off && phase->flux_q29 == 0);
 }
 
 /* Differences that an angle may explain: the phase's, when it alone has them within an electrical revolution and
- * DOUBT_MS, in which all others have conducted within half of the tolerances, and then has one again; else they decide
- * nothing here, and may be the encoder's. A wrong angle shows most in a stroke that begins in its middle, as the first
- * one of a run, and may be within the tolerances in complete ones; a fault of the phase shows in the next stroke, too.
+ * DOUBT_MS, in which all others have conducted within the tolerances, and then has one again; else they decide nothing
+ * here, and may be the encoder's. A wrong angle shows most in a stroke that begins in its middle, as the first one of a
+ * run, and may be within the tolerances in complete ones; a fault of the phase shows in the next stroke, too.
  */
 static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *state, flux_evidence_t *evidence) {
     if (state->doubted == 0) {
         state->doubted_at = residual->sample.periods;
         state->doubt_turned_q24 = 0;
-        state->agreed = state->nearly = 0;
+        state->agreed = 0;
         return;
     }
     state->doubt_turned_q24 = fixed_add(state->doubt_turned_q24, residual->step / 256);
@@ -235,8 +229,8 @@ static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *stat
         return;
     }
     state->doubted = 0;
-    const uint32_t agreed = state->agreed & ~state->nearly;
-    state->agreed = state->nearly = 0;
+    const uint32_t agreed = state->agreed;
+    state->agreed = 0;
     const uint32_t all = (1u << residual->phases) - 1u;
     if (!alone || quiet_q24 >= GONE_Q24 || ((doubted | agreed | residual->sample.lost_phases) & all) != all) {
         return;

@@ -8,9 +8,8 @@
  *                     by a shorted switch. After 1/4 ms it moves, by more than the offset, or is still: at once when
  *                     not even its last bit changes, after 8 ms, or when it ends after 1/2 ms
  *   ..._at_angle      the same two at the measured angle, for 1/32 electrical revolution by the encoder, and again in
- *                     the next stroke, in one phase alone while all others agree within half of the tolerances; a
- *                     second phase within an electrical revolution and 20 ms makes it the encoder's, or what all
- *                     sensors have in common
+ *                     the next stroke, in one phase alone while all others agree; a second phase within an electrical
+ *                     revolution and 20 ms makes it the encoder's, or what all sensors have in common
  *   missing           voltage without current, or a current that has ended within the last 2 ms before the voltage had
  *                     removed it
  *
@@ -52,7 +51,6 @@ typedef struct {
     uint32_t doubted;         /* bit of each phase with a difference that an angle may explain */
     int doubted_side;         /* of the last one */
     uint32_t agreed;          /* bit of each phase that has conducted without a difference since */
-    uint32_t nearly;          /* of each phase that was beyond half of the tolerances since */
     uint32_t doubted_at;      /* period of the first one */
     int32_t doubt_turned_q24; /* rotation since the first one, electrical rev, Q7.24 */
     int32_t quiet_turned_q24; /* since the last one, likewise */
