@@ -103,8 +103,8 @@ bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sample);
 void flux_residual_follow(flux_residual_t *residual, int32_t correction_q29[HAL_PHASES_MAX]);
 
 /* Least and largest psi(f) by its tolerance, Wb, Q2.29. */
-int32_t flux_residual_least_q29(const flux_residual_t *residual, unsigned phase);
-int32_t flux_residual_most_q29(const flux_residual_t *residual, unsigned phase);
+int32_t flux_residual_least_q29(const flux_residual_t *residual, unsigned index);
+int32_t flux_residual_most_q29(const flux_residual_t *residual, unsigned index);
 
 /* Of the tables, up to `width` from a distance from the unaligned position (phase_map.h), 2^-32 electrical rev; with
  * the width HALF_REV at any angle. The least at one current, the largest at another, A, Q7.9. */

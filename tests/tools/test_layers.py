@@ -29,7 +29,7 @@ FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
 JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h",
                                "emulator/qemu/image/main.c"}
 
-CIRCLES_TO_BE_SPLIT = "emulator/campaign/oracle"
+CIRCLES_TO_BE_SPLIT = "emulator/campaign/world"
 """Modules that may still call each other in a circle."""
 
 PYTHON_LAYERS = (
@@ -172,7 +172,7 @@ def test_calls_follow_the_layers() -> None:
     assert "emulator/rig/scheduler.c" in graph["emulator/rig/server.c"], "a call"
     assert "emulator/rig/stimulus.c" in graph["emulator/rig/rig.c"], "an address"
     assert "emulator/rig/can_bus.c" in graph["emulator/rig/shared_bus.h"], "a call from a header"
-    assert "hal/hal_pwm.h" in graph["firmware/drive.c"], "a port's function"
+    assert "hal/hal_pwm.h" in graph["firmware/drive/drive.c"], "a port's function"
     assert list(upwards(graph, C_LAYERS, "/")) == []
 
 

@@ -39,13 +39,9 @@ def test_every_fault_of_the_drive_has_a_bug() -> None:
     assert faults - claims == {"none"}
 
 
-def test_the_summary_counts_every_bug_of_its_commit() -> None:
-    note = json.loads(planted.SUMMARY.read_text(encoding="utf-8"))
-    nobody = [name for name, kinds in note["missed"].items() if len(kinds) == len(planted.named(name).found_by)]
-    assert note["bugs"] == note["found"] + len(nobody) > 200
-    for kind in planted.KINDS:
-        missed = sum(kind in kinds for kinds in note["missed"].values())
-        assert note[kind]["looked"] == note[kind]["found"] + missed > 20
+def test_the_summary_counts_the_bugs_of_the_campaign() -> None:
+    of = json.loads(planted.SUMMARY.read_text(encoding="utf-8"))["campaign"]
+    assert 50 < of["found"] <= of["looked"] and of["replayed"] <= of["found"]
 
 
 @pytest.mark.parametrize(("change", "message"), [

@@ -164,7 +164,7 @@ def run_replay(options: argparse.Namespace) -> int:
               + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
     again = replay(seed, kept, healthy, folder, options.build, programs)
-    whole = kept == ALL_EVENTS and failure.canary is None
+    whole = kept == ALL_EVENTS and failure.bug is None
     listed = known.of_world(seed, healthy) if whole else set()
     for violation in again.campaign["violations"]:
         word = "known deviation" if names.violation(violation) in listed else "violation"

@@ -97,7 +97,7 @@ def _planted() -> tuple[str, str, str]:
             f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} processor "
             f"seconds each, {middle_s:.1f} in the middle, by seeds from 1 to at most {of['last_seed']}; shrunk to at "
             f"most {of['events']} events in at most {of['shrinking_s']:.1f} processor seconds; {of['replayed']} "
-            "replayed with equal bits, log and plots; those of the tests too in [planted.json](../tests/planted.json)",
+            "replayed with equal bits, log and plots; the counts are in [planted.json](../tests/planted.json)",
             "`build/venv/bin/python -m salient.experiments.planted`")
 
 
