@@ -51,7 +51,7 @@ def test_modules_account_for_every_instruction_and_belong_to_the_controller(cont
     assert abs(modules.total() - int(profile.interrupts.sum())) <= len(modules)  # each is rounded
     executed = {name for name, mean in profile.mean_by_module().items() if mean > 5}
     others = set().union(*LAWS.values()) - LAWS[controller]
-    assert executed >= LAWS[controller] | {"control", "load_observer", "protection", "state_machine", "modulator"}
+    assert executed >= LAWS[controller] | {"control_step", "load_observer", "protection", "state_machine", "modulator"}
     assert not executed & others
     files = profile.trace.coverage().files
     for name in DEFERRED[controller]:
