@@ -55,7 +55,7 @@ bool facts_checks_late(const observation_t *seen);
 /* That, or memory or clock of the drive was changed. */
 bool facts_drive_disturbed(const observation_t *seen);
 
-/* What was on the bus may not have reached the drive, or not in time. */
+/* Frames on the bus may not have reached the drive, or not in time. */
 bool facts_may_be_deaf(const observation_t *seen);
 
 /* The frames of the drive are of the present: neither disturbed nor older than a reset. */
@@ -74,7 +74,7 @@ bool facts_runs_by_speed(const observation_t *seen);
 /* The client has been heard within the time after which the torque ramps to zero, and its request has an effect. */
 bool facts_heard(const observation_t *seen);
 
-/* The drive hears a command to turn at a speed that is none near zero. */
+/* The drive hears a command to turn at a speed that is not near zero. */
 bool facts_pushed(const observation_t *seen);
 
 /* A frame may wait in the drive for its background, at most for the watchdog's 18 ms: this time later. */

@@ -19,7 +19,7 @@
  * as an error of phases or of the angle. */
 #define LINK_VOLTAGE (CAUSE_BIT(UNDER_VOLTAGE) | CAUSE_BIT(OVER_VOLTAGE) | PHASE | ENCODER)
 
-/* What is judged by a wrong limit or constant before the change is noticed may fail in any way; a state that is not
+/* Judgements by a wrong limit or constant before the change is noticed may fail in any way; a state that is not
  * that of the checks, and a latch that is changed, may have any name. */
 #define ANY UINT32_MAX
 

@@ -1,4 +1,4 @@
-/* What each fault of the bench disturbs, and which first causes a drive may name for it: a row for each kind of rig.dbc
+/* Disturbances by each fault of the bench, and the first causes a drive may name for it: a row for each kind of rig.dbc
  * and for each bench variable that is a disturbance. The only place that knows kinds by more than their name. */
 #ifndef CAMPAIGN_FAULT_EFFECTS_H
 #define CAMPAIGN_FAULT_EFFECTS_H

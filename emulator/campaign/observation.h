@@ -24,7 +24,7 @@ typedef struct {
     double winding_C, switch_C;
 } observation_heat_t;
 
-/* What is read of the drive. */
+/* Members of the drive that are read. */
 typedef struct {
     uint8_t state;                                /* STATE_* */
     uint8_t fault;                                /* first cause */

@@ -267,7 +267,7 @@ void phase_steps_reset(plant_t *plant) {
     }
 }
 
-/* What the samples within a step need of it. */
+/* Values of a step that its samples need. */
 typedef struct {
     phase_record_t phases[HAL_PHASES_MAX];
     link_record_t link;

@@ -51,7 +51,7 @@ typedef struct {
     double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown, that of arc and avalanche */
 } plant_path_t;
 
-/* What phase_steps.h keeps of a phase from step to step. */
+/* State of a phase between the steps of phase_steps.h. */
 typedef struct {
     bool known; /* the magnetics at this current and angle are in `point` */
     double current_A, angle_rad;

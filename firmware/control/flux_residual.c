@@ -133,7 +133,7 @@ COLD bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sam
     return true;
 }
 
-/* What brings the integral nearer to the tables. */
+/* Corrections that bring the integral nearer to the tables. */
 static int32_t correction_of(const flux_residual_t *residual, flux_residual_phase_t *phase, int32_t next_q29) {
     const int32_t flux_q29 = phase->flux_q29;
     if (phase->none) {

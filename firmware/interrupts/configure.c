@@ -394,7 +394,7 @@ static degraded_parameters_t degraded_from(const control_parameters_t *control, 
     };
 }
 
-/* What the parameters are derived from. */
+/* Sources of the derived parameters. */
 typedef struct {
     const int32_t *values; /* of the user's parameters */
     const machine_tables_t *tables;
@@ -487,7 +487,7 @@ static void set_torque_control(control_parameters_t *control, const source_t *fr
     set_reference_point(control, values, from->tables, from->control_rate_hz);
 }
 
-/* What learns or adapts during a run; after the laws, whose parameters it needs. */
+/* Laws that learn or adapt during a run; after the others, whose parameters they need. */
 static void set_estimators(control_parameters_t *control, const source_t *from) {
     const int32_t *values = from->values;
     const machine_tables_t *tables = from->tables;

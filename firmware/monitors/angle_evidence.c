@@ -80,7 +80,7 @@ int32_t angle_evidence_flux_error_q29(int64_t acceleration, int32_t current_q9, 
     return 2 * fixed_multiply_high(rise_q29, (int32_t)step);
 }
 
-/* What all phases have in common in a sample. */
+/* Values that all phases have in common in a sample. */
 typedef struct {
     const angle_evidence_parameters_t *parameters;
     const flux_residual_t *residual;

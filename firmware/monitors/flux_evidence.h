@@ -1,5 +1,5 @@
-/* What a sample shows about phases and encoder by their flux linkage: the conditions of flux_verdict.def, each with its
- * time. Masks have a bit of each phase for which the condition holds. */
+/* Evidence of a sample about phases and encoder by their flux linkage: the conditions of flux_verdict.def, each with
+ * its time. Masks have a bit of each phase for which the condition holds. */
 #ifndef MONITORS_FLUX_EVIDENCE_H
 #define MONITORS_FLUX_EVIDENCE_H
 

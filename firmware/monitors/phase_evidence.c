@@ -83,7 +83,7 @@ static difference_t compare(const flux_residual_t *residual, phase_evidence_phas
     const flux_band_t here = tolerated(residual, distance, ANGLE_TOLERANCE, phase->current_q9, residual->offset_q9);
     if (high_q29 > here.most_q29) {
         *side = 1;
-        /* What tables of a wrong angle have added shows no more than an angle. */
+        /* Flux linkage that tables of a wrong angle have added shows no more than an angle. */
         const int32_t by_voltage_q29 = fixed_subtract(high_q29, fixed_non_negative(phase->followed_q29));
         const flux_band_t anywhere = tolerated(residual, 0, HALF_REV, phase->current_q9, 0);
         return by_voltage_q29 > anywhere.most_q29 ? BEYOND_ANGLES : WITHIN_ANGLES;

@@ -1,4 +1,4 @@
-"""Planted bugs fit the sources and the tests; those who have to find them do, and a bug that nobody finds is told."""
+"""Planted bugs fit the sources and the tests, are found by the tests that have to find them, or reported as missed."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 
 static void on_frame(const observation_t *seen, void *memory, checker_report_t *report, const checker_frame_t *frame) {
     (void)memory;
-    /* That of the limit, which comes first, has a right one. */
+    /* The response for the limit, which comes first, is right. */
     const bool of_limit = seen->limit.limited != NULL && seen->limit.applied == 1;
     if (frame->identifier != DRIVE_PARAMETER_RESPONSE_FRAME_ID || seen->limit.applied_ns != seen->time_ns || of_limit) {
         return;

@@ -19,7 +19,7 @@ typedef struct checker_report checker_report_t;
 /* The property is violated now: remembered once for each number, which distinguishes ways to violate it. */
 void checker_violated(checker_report_t *report, unsigned number, double value);
 
-/* What must happen in some run of a campaign has happened. */
+/* An event that some run of a campaign must contain has happened. */
 void checker_reached(checker_report_t *report, unsigned number);
 
 /* state: of state_size bytes, zeros before the run. Functions may be NULL. */

@@ -61,9 +61,9 @@ static bool true_of_plant(const observation_t *seen, unsigned cause) {
     }
 }
 
-/* What the plant shows is not the drive's own work. A drive with healthy sensors, phases, supply and processor does not
- * exceed its current; without a load that drives it neither its speed, nor the voltage of a link that is fed as it
- * should be, even when the link takes no energy. */
+/* A reason that the plant shows and that is not the drive's own work. A drive with healthy sensors, phases, supply and
+ * processor does not exceed its current; without a load that drives it neither its speed, nor the voltage of a link
+ * that is fed as it should be, even when the link takes no energy. */
 static bool has_reason(const observation_t *seen, unsigned cause) {
     const sender_meaning_t *meant = &seen->client.meant;
     const bool unsound = facts_disturbed(seen, OF_SENSORS | DISTURBS_SHAFT | DISTURBS_LOAD) ||

@@ -70,7 +70,8 @@ static bool identifiers_conflict(const observation_t *seen) {
     return false;
 }
 
-/* What keeps a drive in a fault is still there: memory that has changed, until a reset; safe torque off; heat. */
+/* The reason for which a drive stays in a fault is still there: memory that has changed, until a reset; safe torque
+ * off; heat. */
 static bool cause_remains(const observation_t *seen) {
     const uint8_t last = seen->causes ? seen->cause[seen->causes - 1] : 0;
     return facts_ever_disturbed(seen, DISTURBS_MEMORY) || lines_differed(seen) || heated_by_sensor(seen) ||

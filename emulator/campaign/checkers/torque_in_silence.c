@@ -34,7 +34,7 @@ static bool answers_load(const observation_t *seen) {
     return answers;
 }
 
-/* Of one quadrant a rotor that is turned backwards generates while it freewheels. */
+/* With one quadrant a rotor that is turned backwards generates while it freewheels. */
 static bool has_grown(const observation_t *seen, const state_t *state, double torque_Nm) {
     return facts_undisturbed(seen) && !answers_load(seen) &&
            (facts_four_quadrants(seen) || seen->plant->speed_rad_s > 0.0) &&

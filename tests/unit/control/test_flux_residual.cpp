@@ -2,52 +2,19 @@
 #include <cstdint>
 #include <utility>
 
-#include <gtest/gtest.h>
-
-extern "C" {
-#include "control/flux_residual.h"
-}
-
-#include "support/phase_map_results.h"
+#include "support/flux_samples.h"
 
 namespace {
 
-constexpr double Q29 = 536870912.0;
-constexpr uint32_t UNALIGNED = 0x80000000u;
-constexpr uint32_t MIDDLE = 0xC0000000u;
-constexpr int32_t PERIOD_Q29 = int32_t(240.0 * 25e-6 * Q29);
-
-class FluxResidual : public testing::Test {
+class FluxResidual : public FluxSamples {
   protected:
-    void SetUp() override {
-        input.run = true;
-        input.periods_per_ms = 40;
-        input.stroke = 0x55555555u;
-        input.electrical = UNALIGNED;
-        input.period_flux_q29 = PERIOD_Q29;
-        for (bool &off : input.off) {
-            off = true;
-        }
-    }
-
     void step() {
         input.periods++;
         ASSERT_TRUE(flux_residual_step(&residual, &input));
         flux_residual_follow(&residual, correction_q29);
     }
 
-    void set(unsigned phase, double current_A, double flux_Wb) {
-        input.current_q9[phase] = int32_t(current_A * 512.0);
-        input.flux_q29[phase] = int32_t(flux_Wb * Q29);
-        input.off[phase] = false;
-    }
-    double table_Wb(double current_A) const {
-        return phase_map_results::flux_q29(machine_tables, input.electrical, int32_t(current_A * 512.0)) / Q29;
-    }
-
     flux_residual_t residual{};
-    flux_sample_t input{};
-    int32_t correction_q29[HAL_PHASES_MAX] = {};
 };
 
 TEST_F(FluxResidual, the_resistive_drop_is_summed_from_zero_to_zero_current) {

@@ -71,7 +71,7 @@ class Bug:
         return re.sub(r"\W+", "_", self.name)
 
     def finders(self, kind: str) -> tuple[str, ...]:
-        """Those of a kind."""
+        """Finders of a kind."""
         return tuple(finder for finder in self.found_by if kind_of(finder) == kind)
 
     def text(self) -> str:

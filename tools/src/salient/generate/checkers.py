@@ -27,9 +27,9 @@ seed.
 """
 
 _GROUPS = {
-    "CHECKER_NEVER": "What may never happen",
-    "CHECKER_IN_TIME": "What must happen in time",
-    "CHECKER_SOMETIMES": "What must have happened sometimes",
+    "CHECKER_NEVER": "Never",
+    "CHECKER_IN_TIME": "In time",
+    "CHECKER_SOMETIMES": "Sometimes",
 }
 
 
@@ -40,7 +40,7 @@ def table() -> list[tuple[str, str]]:
 
 
 def property_of(name: str) -> str:
-    """What a checker's file says of itself."""
+    """Property that a checker's file states."""
     text = (CAMPAIGN / "checkers" / f"{name}.c").read_text(encoding="utf-8")
     found = re.match(r"/\*(.*?)\*/", text, re.DOTALL)
     return " ".join(found[1].replace("\n *", " ").split()) if found else ""

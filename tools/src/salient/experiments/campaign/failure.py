@@ -173,7 +173,7 @@ def save(seed: int, violation: str, folder: Path, healthy: bool = False, bug: st
 
 @dataclass(frozen=True)
 class Failure:
-    """What a failure's folder asks to be run. bug: name of the planted one that its programs had."""
+    """Run that a failure's folder asks for. bug: name of the planted one that its programs had."""
 
     seed: int
     kept: int
