@@ -103,8 +103,8 @@ static protection_parameters_t protection_from(const int32_t *values, int32_t an
     const uint64_t step = ((uint64_t)over_speed_q22 * (uint64_t)angle_step_q32 >> 32) * 3 / 2;
     return (protection_parameters_t){
         .current_trip_q9 = values[PARAMETER_CURRENT_TRIP_A],
-        .dc_link_over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V],
-        .dc_link_under_voltage_q6 = values[PARAMETER_BUS_UNDER_VOLTAGE_V],
+        .dc_link_over_voltage_q6 = values[PARAMETER_OVER_VOLTAGE_V],
+        .dc_link_under_voltage_q6 = values[PARAMETER_UNDER_VOLTAGE_V],
         .angle_step_max = fixed_saturate((int64_t)step + 2 * (int64_t)count),
         /* A quarter of a degree and four counts. Of a coarse encoder sixteen counts: a load step may stop the rotor
          * within a count, and the observer needs several to notice. */
@@ -215,9 +215,9 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, boo
                                                       uint32_t control_rate_hz, unsigned encoder_bits) {
     const uint32_t steady_rad_s =
         (uint32_t)values[schedules_bandwidth ? PARAMETER_OBSERVER_STEADY_RAD_S : PARAMETER_OBSERVER_BANDWIDTH_RAD_S];
-    const bool adaptive = schedules_bandwidth && values[PARAMETER_OBSERVER_WAKING] != 0;
+    const bool adaptive = schedules_bandwidth && values[PARAMETER_OBSERVER_SCHEDULING] != 0;
     return observer_bandwidth_configure(&(observer_bandwidth_settings_t){
-        .transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_WAKE_RAD_S] : steady_rad_s,
+        .transient_rad_s = adaptive ? (uint32_t)values[PARAMETER_OBSERVER_TRANSIENT_RAD_S] : steady_rad_s,
         .moving_rad_s = (uint32_t)values[PARAMETER_OBSERVER_MOVING_RAD_S],
         .steady_rad_s = steady_rad_s,
         .encoder_bits = encoder_bits,
@@ -236,8 +236,8 @@ static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_r
         .scale_q28 = {pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz) << 13,
                       pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz) << 13,
                       pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz) << 13},
-        .network = {.learning_rate_q15 = values[PARAMETER_BP_ETA] >> 13,
-                    .momentum_q32 = values[PARAMETER_BP_ALPHA] << 4},
+        .network = {.learning_rate_q15 = values[PARAMETER_BP_LEARNING_RATE] >> 13,
+                    .momentum_q32 = values[PARAMETER_BP_MOMENTUM] << 4},
     };
 }
 
@@ -264,8 +264,8 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, const mac
     }
     const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
     const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
-    const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_EARLY_DEG]);
-    const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_EARLY_DEG]);
+    const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_ADVANCE_DEG]);
+    const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_ADVANCE_DEG]);
     /* Windows overlap by at least 2 degrees, advanced or not; smaller settings are widened. */
     const uint32_t least = stroke + angle_from_degrees(2 << 7);
     const uint32_t width = fixed_max_u32(turn_off - turn_on, least);
@@ -290,7 +290,7 @@ static conduction_parameters_t conduction_from(const int32_t *values, const mach
     const unsigned phases = tables->phases;
     const torque_sharing_parameters_t sharing = sharing_from(values, tables);
     const torque_sharing_window_t base_window = torque_sharing_window(&sharing, 0);
-    const int32_t over_voltage_q6 = values[PARAMETER_BUS_OVER_VOLTAGE_V];
+    const int32_t over_voltage_q6 = values[PARAMETER_OVER_VOLTAGE_V];
     const int32_t range_q6 = fold_back_range_q6(over_voltage_q6, tables->fold_back_q6);
     const int32_t mean_range_q6 = fold_back_range_q6(over_voltage_q6, tables->mean_fold_back_q6);
     /* A chopper is to have something left to take. */
@@ -497,7 +497,7 @@ static void set_estimators(control_parameters_t *control, const source_t *from) 
     const observer_bandwidth_parameters_t *bandwidth = &control->bandwidth;
     const observer_bandwidth_stage_t *moving = &bandwidth->stage[bandwidth->schedule.moving_stage];
     control->misalignment = misalignment_configure(&(misalignment_settings_t){
-        .rate_1_s = values[PARAMETER_ANGLE_TRIM] != 0 ? values[PARAMETER_ANGLE_TRIM_RATE_1_S] : 0,
+        .rate_1_s = values[PARAMETER_ANGLE_ADAPTATION] != 0 ? values[PARAMETER_ANGLE_ADAPTATION_RATE_1_S] : 0,
         .control_rate_hz = rate_hz,
         .periods_per_update = DEFERRED_LEARNING_PERIODS,
         .periods_per_common_update = DEFERRED_COMMON_PERIODS,

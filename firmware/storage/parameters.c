@@ -106,7 +106,7 @@ static const struct {
     bool below;
 } orders[] = {
     {PARAMETER_CURRENT_LIMIT_A, PARAMETER_CURRENT_TRIP_A, false},
-    {PARAMETER_BUS_UNDER_VOLTAGE_V, PARAMETER_BUS_OVER_VOLTAGE_V, true},
+    {PARAMETER_UNDER_VOLTAGE_V, PARAMETER_OVER_VOLTAGE_V, true},
     {PARAMETER_TURN_ON_ANGLE_DEG, PARAMETER_TURN_OFF_ANGLE_DEG, true},
     {PARAMETER_TURN_OFF_ANGLE_DEG, PARAMETER_OUTGOING_OFF_ANGLE_DEG, false},
     {PARAMETER_TORQUE_BAND_INNER_NM, PARAMETER_TORQUE_BAND_OUTER_NM, false},
@@ -127,13 +127,13 @@ static parameters_verdict_t check_orders(const parameters_t *present, const int3
 /* Of a drive without its supply nothing can be said. */
 static parameters_verdict_t check_supply(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                          int32_t voltage_q6) {
-    const bool supplied = voltage_q6 >= present->values[PARAMETER_BUS_UNDER_VOLTAGE_V] &&
-                          voltage_q6 <= present->values[PARAMETER_BUS_OVER_VOLTAGE_V];
-    if (supplied && voltage_q6 < values[PARAMETER_BUS_UNDER_VOLTAGE_V]) {
-        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_BUS_UNDER_VOLTAGE_V, 0};
+    const bool supplied = voltage_q6 >= present->values[PARAMETER_UNDER_VOLTAGE_V] &&
+                          voltage_q6 <= present->values[PARAMETER_OVER_VOLTAGE_V];
+    if (supplied && voltage_q6 < values[PARAMETER_UNDER_VOLTAGE_V]) {
+        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_UNDER_VOLTAGE_V, 0};
     }
-    if (supplied && voltage_q6 > values[PARAMETER_BUS_OVER_VOLTAGE_V]) {
-        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_BUS_OVER_VOLTAGE_V, 0};
+    if (supplied && voltage_q6 > values[PARAMETER_OVER_VOLTAGE_V]) {
+        return (parameters_verdict_t){PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_OVER_VOLTAGE_V, 0};
     }
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }

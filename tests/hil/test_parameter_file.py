@@ -69,7 +69,7 @@ def test_loaded_file_is_in_the_drive_and_differences_are_listed(can, tmp_path: P
 def test_each_bad_entry_is_one_line_and_nothing_is_set(can, tmp_path: Path):
     file = tmp_path / "drive.toml"
     file.write_text('over_speed_rpm = 1234\nspeed = 5\ncurrent_trip_A = 99\ncurrent_limit_A = "much"\n'
-                    "angle_trim = true\ncommand_timeout_ms = nan\n")
+                    "angle_adaptation = true\ncommand_timeout_ms = nan\n")
     for action in ("load", "compare"):
         result = parameters(action, file, "--can", can)
         assert (result.returncode, result.stdout) == (2, "")
@@ -79,7 +79,7 @@ def test_each_bad_entry_is_one_line_and_nothing_is_set(can, tmp_path: Path):
         assert texts[0].startswith("'speed': unknown parameter; the parameters are controller, ")
         assert texts[1] == "current_trip_A: 99: must be a number from 1.0 to 79.0 A"
         assert texts[2] == "current_limit_A: 'much': must be a number from 1.0 to 79.0 A"
-        assert texts[3] == "angle_trim: True: must be a number from 0 to 1"
+        assert texts[3] == "angle_adaptation: True: must be a number from 0 to 1"
         assert texts[4].startswith("command_timeout_ms: nan: must be a number from ")
     with Session(can, lockstep=False) as session:
         assert session.drive.parameters["over_speed_rpm"] == 3600

@@ -103,7 +103,7 @@ def test_unknown_operation_is_answered(bench):
 
 ARM_IDS = (0x082, 0x083, 0x084)
 """DRIVE_ARM, PARAMETER_WRITE, PARAMETER_SET_CONTROL."""
-TRIPS = {"current_trip_A": 79.0, "bus_over_voltage_V": 510.0, "bus_under_voltage_V": 0.0, "command_timeout_ms": 400.0,
+TRIPS = {"current_trip_A": 79.0, "over_voltage_V": 510.0, "under_voltage_V": 0.0, "command_timeout_ms": 400.0,
          "over_speed_rpm": 4800.0}
 
 
@@ -207,12 +207,12 @@ CONTRADICTIONS = {
     "limit above trip": ({"current_limit_A": 60.0, "current_trip_A": 50.0},
                          "current_limit_A 60: contradicts current_trip_A, 50 A"),
     "limit above the present trip": ({"current_limit_A": 76.0}, "current_limit_A 76: contradicts current_trip_A, 75 A"),
-    "under above over voltage": ({"bus_under_voltage_V": 230.0, "bus_over_voltage_V": 220.0},
-                                 "bus_under_voltage_V 230: contradicts bus_over_voltage_V, 220 V"),
-    "over voltage below the supply": ({"bus_over_voltage_V": 200.0},
-                                      r"bus_over_voltage_V 200: excludes the present DC-link voltage, 2(39|40).* V"),
-    "under voltage above the supply": ({"bus_under_voltage_V": 250.0},
-                                       r"bus_under_voltage_V 250: excludes the present DC-link voltage, 2(39|40).* V"),
+    "under above over voltage": ({"under_voltage_V": 230.0, "over_voltage_V": 220.0},
+                                 "under_voltage_V 230: contradicts over_voltage_V, 220 V"),
+    "over voltage below the supply": ({"over_voltage_V": 200.0},
+                                      r"over_voltage_V 200: excludes the present DC-link voltage, 2(39|40).* V"),
+    "under voltage above the supply": ({"under_voltage_V": 250.0},
+                                       r"under_voltage_V 250: excludes the present DC-link voltage, 2(39|40).* V"),
     "turn-off before turn-on": ({"turn_on_angle_deg": 301.0}, "turn_on_angle_deg 301: contradicts turn_off_angle_deg"),
     "hysteresis bands": ({"torque_band_inner_Nm": 2.0}, "torque_band_inner_Nm 2: contradicts torque_band_outer_Nm, 1 "),
     "out of range": ({"current_trip_A": 80.0}, "current_trip_A 80: must be 1 to 79 A"),
@@ -301,7 +301,7 @@ TUNED = {
     "paper": {"smc_k": 500.0, "smc_epsilon": 0.75, "smc_delta": 0.5, "observer_bandwidth_rad_s": 600.0,
               "bp_kp_max": 0.25, "bp_ki_max": 0.1875, "bp_kd_max": 0.125},
     "salient": {"smc_k": 500.0, "smc_epsilon": 0.75, "smc_delta": 0.5, "observer_steady_rad_s": 400.0,
-                "observer_wake_rad_s": 6000.0, "flux_observer_gain": 0.375},
+                "observer_transient_rad_s": 6000.0, "flux_observer_gain": 0.375},
 }
 
 

@@ -236,7 +236,7 @@ def test_encoder_misalignment_is_learned_and_the_ripple_falls(run_recorded, offs
 def test_no_misalignment_is_learned_when_learning_is_off(make_bench):
     bench = make_bench(controller="salient")
     bench.rig.encoder_offset_deg = 0.3
-    loaded_150(0.8, {"angle_trim": 0})(bench)
+    loaded_150(0.8, {"angle_adaptation": 0})(bench)
     assert set(bench.telemetry["misalignment_deg"].value) == {0.0}
 
 

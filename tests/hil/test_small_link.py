@@ -61,7 +61,7 @@ class Run:
     def highest_V(self, from_s: float = 0.0) -> float:
         """As a part of the trip."""
         voltage = self.bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].between(from_s, self.bench.time_s + 1e-9).value
-        return float(np.max(voltage)) / self.data.bus_over_voltage_V
+        return float(np.max(voltage)) / self.data.over_voltage_V
 
     def braking_W(self, rpm: float) -> float:
         """Mechanical, with the largest braking torque commanded at once at a held speed."""
@@ -129,7 +129,7 @@ def test_braking_torque_at_once_at_a_held_speed_is_no_trip_and_at_least_half_of_
 
 def test_a_strong_chopper_brakes_with_the_whole_torque_though_the_link_is_small(make_run):
     run = make_run("eight_six_400_V", 1.5e-3, 10.0)
-    rise = field_J(run.machine, run.data.parameters["current_limit_A"]) / (1.5e-3 * run.data.bus_over_voltage_V**2)
+    rise = field_J(run.machine, run.data.parameters["current_limit_A"]) / (1.5e-3 * run.data.over_voltage_V**2)
     assert 0.05 < rise < 0.065, "of the trip voltage, by the field of a phase"
     assert run.braking_W(run.data.speed_base_rpm) > 0.95 * 2.0 * math.pi / 60.0 * (
         run.data.torque_peak_Nm * run.data.speed_base_rpm)

@@ -52,14 +52,14 @@ def test_scenario_without_a_command_may_leave_the_drive_as_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(("parameters", "bench", "message"), [
-    ({"bus_under_voltage_V": 310}, {},
-     "parameters.bus_under_voltage_V: 310 V: must be below bus_over_voltage_V, 300 V"),
+    ({"under_voltage_V": 310}, {},
+     "parameters.under_voltage_V: 310 V: must be below over_voltage_V, 300 V"),
     ({"current_limit_A": 79}, {}, "parameters.current_limit_A: 79 A: must not be above current_trip_A, 75 A"),
     ({"current_limit_A": 30, "current_trip_A": 29}, {},
      "parameters.current_limit_A: 30 A: must not be above current_trip_A, 29 A"),
-    ({"bus_under_voltage_V": 241}, {}, "supply_voltage_V: 240 V: must not be below bus_under_voltage_V, 241 V"),
-    ({"bus_over_voltage_V": 239}, {}, "supply_voltage_V: 240 V: must not be above bus_over_voltage_V, 239 V"),
-    ({}, {"supply_voltage_V": 48.0}, "supply_voltage_V: 48 V: must not be below bus_under_voltage_V, 150 V"),
+    ({"under_voltage_V": 241}, {}, "supply_voltage_V: 240 V: must not be below under_voltage_V, 241 V"),
+    ({"over_voltage_V": 239}, {}, "supply_voltage_V: 240 V: must not be above over_voltage_V, 239 V"),
+    ({}, {"supply_voltage_V": 48.0}, "supply_voltage_V: 48 V: must not be below under_voltage_V, 150 V"),
 ])  # fmt: skip
 def test_contradiction_is_refused_in_one_line_that_names_both(parameters, bench, message):
     scenario = Scenario(name="a", duration_s=0.1, speed=(SpeedStep(0.0, 100.0),), parameters=parameters, bench=bench)
@@ -69,6 +69,6 @@ def test_contradiction_is_refused_in_one_line_that_names_both(parameters, bench,
 
 
 @pytest.mark.parametrize("parameters", [{}, {"current_limit_A": 75}, {"current_trip_A": 20},
-                                        {"bus_under_voltage_V": 240, "bus_over_voltage_V": 241}])
+                                        {"under_voltage_V": 240, "over_voltage_V": 241}])
 def test_consistent_parameters_and_a_lowered_trip_are_accepted(parameters):
     check_parameters([Scenario(name="a", duration_s=0.1, parameters=parameters)], "host")

@@ -77,7 +77,7 @@ def test_every_value_is_finite_and_in_order(path):
     assert data.torque_rated_Nm <= data.torque_peak_Nm < smooth_torque_Nm(machine.magnetics, machine.phases,
                                                                          data.current_peak_A)
     assert data.speed_base_rpm <= data.speed_max_rpm < data.over_speed_rpm
-    assert data.bus_under_voltage_V < data.supply_min_V <= data.supply_max_V < data.bus_over_voltage_V
+    assert data.under_voltage_V < data.supply_min_V <= data.supply_max_V < data.over_voltage_V
     # The voltage makes the rated torque at the base speed, and the bound of a start is not below that of the torque.
     source = Source(data.supply_min_V, machine.resistance_ohm)
     pulses = single_pulse(replace(machine, supply_voltage_V=data.supply_min_V), data)

@@ -219,7 +219,7 @@ def test_every_quantity_has_the_range_and_the_resolution_that_the_machine_needs(
         ("torque on the bus", data.torque_peak_Nm, data.torque_rated_Nm, 1e-3),
         ("speed on the bus", data.over_speed_rpm, data.speed_base_rpm, 1e-5),
         ("current sensor", data.parameters["current_trip_A"], data.current_rated_A, 1e-3),
-        ("DC-link divider", data.parameters["bus_over_voltage_V"], data.supply_max_V, 1e-3),
+        ("DC-link divider", data.parameters["over_voltage_V"], data.supply_max_V, 1e-3),
         ("torque transducer", data.torque_peak_Nm, data.torque_rated_Nm, 1e-2),
     ):
         quantity = of.pop(name)

@@ -872,8 +872,8 @@ TEST_F(Drive, five_unprotected_frames_change_nothing) {
     const parameters_t before = drive.parameters;
     const control_parameters_t control_before = drive.control_parameters;
     for (const auto &[index, value] : frames::parameter_writes_t{{PARAMETER_CURRENT_TRIP_A, 79 << 9},
-                                                                 {PARAMETER_BUS_OVER_VOLTAGE_V, 510 << 6},
-                                                                 {PARAMETER_BUS_UNDER_VOLTAGE_V, 0},
+                                                                 {PARAMETER_OVER_VOLTAGE_V, 510 << 6},
+                                                                 {PARAMETER_UNDER_VOLTAGE_V, 0},
                                                                  {PARAMETER_COMMAND_TIMEOUT_MS, 400},
                                                                  {PARAMETER_CONTROLLER, DRIVE_CONTROLLER_SALIENT}}) {
         hal.from_drive.clear();
@@ -1031,10 +1031,10 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
          PARAMETER_STATUS_CONTRADICTION,
          PARAMETER_CURRENT_LIMIT_A,
          PARAMETER_CURRENT_TRIP_A},
-        {{{PARAMETER_BUS_UNDER_VOLTAGE_V, 300 << 6}},
+        {{{PARAMETER_UNDER_VOLTAGE_V, 300 << 6}},
          PARAMETER_STATUS_CONTRADICTION,
-         PARAMETER_BUS_UNDER_VOLTAGE_V,
-         PARAMETER_BUS_OVER_VOLTAGE_V},
+         PARAMETER_UNDER_VOLTAGE_V,
+         PARAMETER_OVER_VOLTAGE_V},
         {{{PARAMETER_TURN_ON_ANGLE_DEG, 300 << 7}},
          PARAMETER_STATUS_CONTRADICTION,
          PARAMETER_TURN_ON_ANGLE_DEG,
@@ -1047,14 +1047,8 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
          PARAMETER_STATUS_CONTRADICTION,
          PARAMETER_TORQUE_BAND_INNER_NM,
          PARAMETER_TORQUE_BAND_OUTER_NM},
-        {{{PARAMETER_BUS_OVER_VOLTAGE_V, (240 << 6) - 1}},
-         PARAMETER_STATUS_EXCLUDES_SUPPLY,
-         PARAMETER_BUS_OVER_VOLTAGE_V,
-         0},
-        {{{PARAMETER_BUS_UNDER_VOLTAGE_V, (240 << 6) + 1}},
-         PARAMETER_STATUS_EXCLUDES_SUPPLY,
-         PARAMETER_BUS_UNDER_VOLTAGE_V,
-         0},
+        {{{PARAMETER_OVER_VOLTAGE_V, (240 << 6) - 1}}, PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_OVER_VOLTAGE_V, 0},
+        {{{PARAMETER_UNDER_VOLTAGE_V, (240 << 6) + 1}}, PARAMETER_STATUS_EXCLUDES_SUPPLY, PARAMETER_UNDER_VOLTAGE_V, 0},
     };
     for (const auto &refused : cases) {
         const auto response = set(refused.writes);
@@ -1066,7 +1060,7 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     // One LSB less of each is accepted.
     for (const frames::parameter_writes_t &accepted :
          {frames::parameter_writes_t{{PARAMETER_CURRENT_LIMIT_A, 75 << 9}},
-          {{PARAMETER_BUS_UNDER_VOLTAGE_V, 240 << 6}, {PARAMETER_BUS_OVER_VOLTAGE_V, (240 << 6) + 1}},
+          {{PARAMETER_UNDER_VOLTAGE_V, 240 << 6}, {PARAMETER_OVER_VOLTAGE_V, (240 << 6) + 1}},
           {{PARAMETER_TURN_ON_ANGLE_DEG, (300 << 7) - 1}},
           {{PARAMETER_TURN_OFF_ANGLE_DEG, 348 << 7}},
           {{PARAMETER_TORQUE_BAND_INNER_NM, 1 << 24}},
@@ -1076,7 +1070,7 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     // Without its supply nothing is said about the thresholds.
     hal.adc.bus_voltage_counts = 0;
     periods(10);
-    EXPECT_EQ(set({{PARAMETER_BUS_OVER_VOLTAGE_V, 300 << 6}}).status, PARAMETER_STATUS_DONE);
+    EXPECT_EQ(set({{PARAMETER_OVER_VOLTAGE_V, 300 << 6}}).status, PARAMETER_STATUS_DONE);
 }
 
 TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_seconds) {
@@ -1290,7 +1284,7 @@ TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_
                 ASSERT_LE(values[i], parameters_row(i)->maximum) << step;
                 ASSERT_TRUE(!running || parameters_tunable(i) || values[i] == before.values[i]) << step;
             }
-            ASSERT_LT(values[PARAMETER_BUS_UNDER_VOLTAGE_V], values[PARAMETER_BUS_OVER_VOLTAGE_V]) << step;
+            ASSERT_LT(values[PARAMETER_UNDER_VOLTAGE_V], values[PARAMETER_OVER_VOLTAGE_V]) << step;
             tuned += running;
         } else {
             refused += may_apply;

@@ -87,7 +87,7 @@ TEST_F(Parameters, every_row_is_sound) {
 TEST_F(Parameters, defaults_are_a_consistent_set) {
     const int32_t *value = parameters.values;
     EXPECT_LT(value[PARAMETER_CURRENT_LIMIT_A], value[PARAMETER_CURRENT_TRIP_A]);
-    EXPECT_LT(value[PARAMETER_BUS_UNDER_VOLTAGE_V], value[PARAMETER_BUS_OVER_VOLTAGE_V]);
+    EXPECT_LT(value[PARAMETER_UNDER_VOLTAGE_V], value[PARAMETER_OVER_VOLTAGE_V]);
     EXPECT_LT(value[PARAMETER_TURN_ON_ANGLE_DEG], value[PARAMETER_TURN_OFF_ANGLE_DEG]);
     EXPECT_LT(value[PARAMETER_TURN_OFF_ANGLE_DEG], value[PARAMETER_OUTGOING_OFF_ANGLE_DEG]);
     EXPECT_LT(value[PARAMETER_TORQUE_BAND_INNER_NM], value[PARAMETER_TORQUE_BAND_OUTER_NM]);
@@ -174,9 +174,9 @@ TEST_F(Parameters, every_operation_with_every_index_is_answered_and_changes_noth
 
 TEST_F(Parameters, what_can_be_changed_in_a_run_is_a_gain) {
     const std::set<std::string> not_tunable = {
-        "controller",          "torque_max_Nm",  "current_limit_A",    "current_trip_A", "bus_over_voltage_V",
-        "bus_under_voltage_V", "over_speed_rpm", "command_timeout_ms", "inertia_kg_m2",  "friction_Nm_s",
-        "resistance_ohm",      "bp_mode",        "pulses_per_period",  "torque_sharing", "load_source"};
+        "controller",      "torque_max_Nm",  "current_limit_A",    "current_trip_A", "over_voltage_V",
+        "under_voltage_V", "over_speed_rpm", "command_timeout_ms", "inertia_kg_m2",  "friction_Nm_s",
+        "resistance_ohm",  "bp_mode",        "pulses_per_period",  "torque_sharing", "load_source"};
     const std::set<std::string> tunable = {"speed_kp", "speed_ki", "smc_k", "smc_delta", "observer_bandwidth_rad_s",
                                            "bp_ki_max"};
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {

@@ -158,15 +158,15 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     near("kp scale", c.duty.pid.scale_q28[0] / 8192.0, pid_scale(PARAMETER_BP_KP_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("ki scale", c.duty.pid.scale_q28[1] / 8192.0, pid_scale(PARAMETER_BP_KI_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
     near("kd scale", c.duty.pid.scale_q28[2] / 8192.0, pid_scale(PARAMETER_BP_KD_MAX), 0.5 * rate_hz / 40000.0 + 1.0);
-    near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_ETA) * fixed_point::Q15, 1.0);
-    near("alpha", c.duty.pid.network.momentum_q32, v(PARAMETER_BP_ALPHA) * fixed_point::Q32, 1.0);
+    near("eta", c.duty.pid.network.learning_rate_q15, v(PARAMETER_BP_LEARNING_RATE) * fixed_point::Q15, 1.0);
+    near("alpha", c.duty.pid.network.momentum_q32, v(PARAMETER_BP_MOMENTUM) * fixed_point::Q32, 1.0);
 
     const double count = std::ldexp(1.0, 32 - int(encoder_bits));
     const double fastest =
         fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) / rate_hz / (2.0 * fixed_point::PI) * fixed_point::REV;
     near("trip", c.protection.current_trip_q9, v(PARAMETER_CURRENT_TRIP_A) * fixed_point::Q9, 0.0);
-    near("over-voltage", c.protection.dc_link_over_voltage_q6, v(PARAMETER_BUS_OVER_VOLTAGE_V) * 64.0, 0.0);
-    near("under-voltage", c.protection.dc_link_under_voltage_q6, v(PARAMETER_BUS_UNDER_VOLTAGE_V) * 64.0, 0.0);
+    near("over-voltage", c.protection.dc_link_over_voltage_q6, v(PARAMETER_OVER_VOLTAGE_V) * 64.0, 0.0);
+    near("under-voltage", c.protection.dc_link_under_voltage_q6, v(PARAMETER_UNDER_VOLTAGE_V) * 64.0, 0.0);
     near("over-speed", c.flux_monitor.encoder.over_speed_q22,
          fixed_point::rad_s(v(PARAMETER_OVER_SPEED_RPM)) * fixed_point::Q22, 0.6);
     near("step", c.protection.angle_step_max, 0.0, fixed_point::REV);
@@ -186,11 +186,11 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     const auto &share = c.conduction.sharing;
     const double stroke = fixed_point::REV / machine_tables.phases;
     const double least = 2.0 / 360.0 * fixed_point::REV;
-    const double on_early = pitch(PARAMETER_SHARE_ON_EARLY_DEG);
+    const double on_early = pitch(PARAMETER_SHARE_ON_ADVANCE_DEG);
     const double asked_width = pitch(PARAMETER_SHARE_OFF_ANGLE_DEG) - pitch(PARAMETER_SHARE_ON_ANGLE_DEG);
     const double width = std::max(asked_width, stroke + least);
     const double narrowing =
-        std::min(pitch(PARAMETER_SHARE_OFF_EARLY_DEG) - on_early, width - stroke - least); // at full advance
+        std::min(pitch(PARAMETER_SHARE_OFF_ADVANCE_DEG) - on_early, width - stroke - least); // at full advance
     ASSERT_EQ(c.interleaved_pwm,
               (salient || c.torque_law == TORQUE_LAW_DUTY) && p.values[PARAMETER_PULSES_PER_PERIOD] == 2);
     ASSERT_EQ(c.load_from_transducer, p.values[PARAMETER_LOAD_SOURCE] == 1);
@@ -221,7 +221,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          1.0);
     near("return", c.conduction.retract_step_q30, 1.0 * DEFERRED_CONDUCTION_PERIODS / rate_hz * fixed_point::Q30, 1.0);
 
-    const double learn_1_s = p.values[PARAMETER_ANGLE_TRIM] == 1 ? v(PARAMETER_ANGLE_TRIM_RATE_1_S) : 0.0;
+    const double learn_1_s = p.values[PARAMETER_ANGLE_ADAPTATION] == 1 ? v(PARAMETER_ANGLE_ADAPTATION_RATE_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / DEFERRED_LEARNING_PERIODS / machine_tables.phases);
     near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);
     near("common misalignment rate", c.misalignment.common_rate_q30,
@@ -249,9 +249,9 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_EQ(steady.speed_gain_q24, gains.speed_gain_q24);
     ASSERT_EQ(steady.load_gain_q28, gains.load_gain_q28);
     ASSERT_EQ(steady.load_factor_q4, gains.load_factor_q4);
-    const bool wakes = schedules && p.values[PARAMETER_OBSERVER_WAKING] == 1 &&
-                       p.values[PARAMETER_OBSERVER_WAKE_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
-    const parameter_index_t widest = wakes       ? PARAMETER_OBSERVER_WAKE_RAD_S
+    const bool wakes = schedules && p.values[PARAMETER_OBSERVER_SCHEDULING] == 1 &&
+                       p.values[PARAMETER_OBSERVER_TRANSIENT_RAD_S] > p.values[PARAMETER_OBSERVER_STEADY_RAD_S];
+    const parameter_index_t widest = wakes       ? PARAMETER_OBSERVER_TRANSIENT_RAD_S
                                      : schedules ? PARAMETER_OBSERVER_STEADY_RAD_S
                                                  : PARAMETER_OBSERVER_BANDWIDTH_RAD_S;
     ASSERT_EQ(c.bandwidth.stage[0].bandwidth_rad_s, p.values[widest]);
@@ -319,7 +319,7 @@ TEST(Configure, braking_torque_decreases_over_the_last_32nd_of_the_voltage_or_ov
     static machine_tables_t tables = machine_tables;
     parameters_t parameters;
     parameters_init(&parameters);
-    const double trip_V = parameters.values[PARAMETER_BUS_OVER_VOLTAGE_V] / 64.0;
+    const double trip_V = parameters.values[PARAMETER_OVER_VOLTAGE_V] / 64.0;
     struct {
         double range_V, mean_V, begin_V, end_V, mean_begin_V, mean_end_V;
         bool longer_pulses;

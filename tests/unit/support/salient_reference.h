@@ -33,7 +33,7 @@ inline units_t units_of(const machine_tables_t &tables) {
         return std::ldexp(1.0, fraction_bits - tables.parameter_fraction_bits[parameter]);
     };
     return {.current_A = unit(PARAMETER_CURRENT_LIMIT_A, 9),
-            .voltage_V = unit(PARAMETER_BUS_OVER_VOLTAGE_V, 6),
+            .voltage_V = unit(PARAMETER_OVER_VOLTAGE_V, 6),
             .torque_Nm = unit(PARAMETER_TORQUE_MAX_NM, 24),
             .speed_rad_s = std::ldexp(1.0, tables.speed_exponent)};
 }

@@ -14,13 +14,13 @@ def check_consistency(values: Mapping[str, float], chosen: Mapping[str, float], 
     the supply. A trip below the current limit is a contradiction only when the limit is chosen: lowering the trip alone
     is how a trip is tested.
     """
-    low_V, high_V = values["bus_under_voltage_V"], values["bus_over_voltage_V"]
+    low_V, high_V = values["under_voltage_V"], values["over_voltage_V"]
     limit_A, trip_A = values["current_limit_A"], values["current_trip_A"]
     if low_V >= high_V:
-        raise UsageError(f"parameters.bus_under_voltage_V: {low_V:g} V: must be below bus_over_voltage_V, {high_V:g} V")
+        raise UsageError(f"parameters.under_voltage_V: {low_V:g} V: must be below over_voltage_V, {high_V:g} V")
     if "current_limit_A" in chosen and limit_A > trip_A:
         raise UsageError(f"parameters.current_limit_A: {limit_A:g} A: must not be above current_trip_A, {trip_A:g} A")
     if supply_V < low_V:
-        raise UsageError(f"supply_voltage_V: {supply_V:g} V: must not be below bus_under_voltage_V, {low_V:g} V")
+        raise UsageError(f"supply_voltage_V: {supply_V:g} V: must not be below under_voltage_V, {low_V:g} V")
     if supply_V > high_V:
-        raise UsageError(f"supply_voltage_V: {supply_V:g} V: must not be above bus_over_voltage_V, {high_V:g} V")
+        raise UsageError(f"supply_voltage_V: {supply_V:g} V: must not be above over_voltage_V, {high_V:g} V")

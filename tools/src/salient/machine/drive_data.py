@@ -99,12 +99,12 @@ class DriveData:
         return self.parameters["over_speed_rpm"]
 
     @property
-    def bus_over_voltage_V(self) -> float:
-        return self.parameters["bus_over_voltage_V"]
+    def over_voltage_V(self) -> float:
+        return self.parameters["over_voltage_V"]
 
     @property
-    def bus_under_voltage_V(self) -> float:
-        return self.parameters["bus_under_voltage_V"]
+    def under_voltage_V(self) -> float:
+        return self.parameters["under_voltage_V"]
 
 
 def derive(machine: Machine) -> DriveData:
@@ -173,7 +173,7 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
              "16/15 max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), or 80 A times a power of two below it "
              "that has room for 80/79 (1.01 current_peak_A + 2.4 V Ts / Lu) and 10/9 current_peak_A")
     over_V, _ = _over_voltage(machine, maximum_V)
-    data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 bus_over_voltage_V")
+    data.add("adc_voltage_V", "V", 1.25 * over_V, "1.25 over_voltage_V")
     data.add("torque_step_Nm", "N m",
              maximum_V / rate_hz * torque_per_flux_Nm_Wb(magnetics, 0.5 * peak_A),
              "supply_max_V Ts dT/dpsi at half of current_peak_A")
@@ -301,8 +301,8 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "current_trip_A": (trip_A,
                            "max(1.5 current_peak_A, 1.1 current_peak_A + 2.2 V Ts / Lu), at most 15/16 of "
                            "adc_current_A, or up to 79/80 of it for at least 1.01 current_peak_A + 2.4 V Ts / Lu"),
-        "bus_over_voltage_V": (over_V, over_V_formula),
-        "bus_under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
+        "over_voltage_V": (over_V, over_V_formula),
+        "under_voltage_V": (0.625 * data["supply_min_V"], "0.625 supply_min_V"),
         "over_speed_rpm": (1.2 * data["speed_max_rpm"], "1.2 speed_max_rpm"),
         "turn_on_angle_deg": (on_deg, "180 + on less the angle in which V builds up Lu current_rated_A at half of "
                               "speed_base_rpm, at least 180"),
@@ -320,7 +320,7 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "smc_delta": (min(max(1.0, 0.1 * acceleration / base_rad_s), 8.0 / (acceleration * torque_removed_s)),
                       "max(1, 0.1 s a / speed_base_rpm), at most 8 / (a (torque_max_Nm / torque_step_Nm + 3) Ts)"),
         "observer_bandwidth_rad_s": (min(0.025 / period_s, 8000.0), "0.025 / Ts"),
-        "observer_wake_rad_s": (min(0.225 / period_s, 10_000.0), "0.225 / Ts, at most 10000"),
+        "observer_transient_rad_s": (min(0.225 / period_s, 10_000.0), "0.225 / Ts, at most 10000"),
         "observer_moving_rad_s": (min(0.045 / period_s, 10_000.0), "0.045 / Ts, at most 10000"),
         "bp_error_scale_Nm": (max(rated_Nm / 8.0, 3.0 * step_40_kHz_Nm),
                               "max(torque_rated_Nm / 8, 3 torque_step_Nm at 40 kHz)"),
@@ -365,10 +365,10 @@ def check(machine: Machine) -> None:
     in_order("current_peak_A", "adc_current_A", 0.9)
     in_order("current_limit_A", "current_trip_A", 0.98)
     in_order("current_trip_A", "adc_current_A", 0.9875)
-    in_order("bus_under_voltage_V", "supply_min_V", 0.98)
-    in_order("supply_max_V", "bus_over_voltage_V", 0.98)
-    in_order("dc_link.chopper_on_V", "bus_over_voltage_V")
-    in_order("bus_over_voltage_V", "adc_voltage_V", 0.995)
+    in_order("under_voltage_V", "supply_min_V", 0.98)
+    in_order("supply_max_V", "over_voltage_V", 0.98)
+    in_order("dc_link.chopper_on_V", "over_voltage_V")
+    in_order("over_voltage_V", "adc_voltage_V", 0.995)
     in_order("speed_max_rpm", "over_speed_rpm")
     in_order("torque_band_inner_Nm", "torque_band_outer_Nm")
     most_Nm = mean_torque_Nm(machine.magnetics, machine.phases, data.current_peak_A)

@@ -27,26 +27,26 @@ _ROOM_ABOVE_CHOPPER = 1.75
 
 
 def fold_back_V(machine: Machine, data: DriveData) -> float:
-    """Range below bus_over_voltage_V in which the voltage of each control period reduces the braking torque. There is
-    none from its middle on, or from a quarter of the way from the chopper's voltage to bus_over_voltage_V on if that is
+    """Range below over_voltage_V in which the voltage of each control period reduces the braking torque. There is
+    none from its middle on, or from a quarter of the way from the chopper's voltage to over_voltage_V on if that is
     higher. 0 for a supply that takes energy back."""
     link = machine.dc_link
     if link is None:
         return 0.0
-    rise_V = field_J(machine, data.parameters["current_limit_A"]) / (link["capacitance_F"] * data.bus_over_voltage_V)
-    taken_A = data.bus_over_voltage_V / link.get("chopper_resistance_ohm", math.inf)
+    rise_V = field_J(machine, data.parameters["current_limit_A"]) / (link["capacitance_F"] * data.over_voltage_V)
+    taken_A = data.over_voltage_V / link.get("chopper_resistance_ohm", math.inf)
     strength = taken_A / (_STRONG_CHOPPER * data.parameters["current_limit_A"])
     rises = max(_RISES_LEAST, _RISES - (_RISES - _RISES_LEAST) * strength)
-    above_chopper_V = _ROOM_ABOVE_CHOPPER * (data.bus_over_voltage_V - link.get("chopper_on_V", 0.0))
+    above_chopper_V = _ROOM_ABOVE_CHOPPER * (data.over_voltage_V - link.get("chopper_on_V", 0.0))
     range_V = max(_RISES_LEAST * rise_V, min(rises * rise_V, above_chopper_V))
-    return min(range_V, data.bus_over_voltage_V - data.supply_max_V)
+    return min(range_V, data.over_voltage_V - data.supply_max_V)
 
 
 def mean_fold_back_V(machine: Machine, data: DriveData) -> float:
-    """Range below bus_over_voltage_V from whose begin on a lasting excess reduces the braking torque, too: above the
+    """Range below over_voltage_V from whose begin on a lasting excess reduces the braking torque, too: above the
     voltage at which the chopper begins, which would otherwise take little."""
     chopper_on_V = (machine.dc_link or {}).get("chopper_on_V", 0.0)
-    return min(fold_back_V(machine, data), data.bus_over_voltage_V - chopper_on_V)
+    return min(fold_back_V(machine, data), data.over_voltage_V - chopper_on_V)
 
 
 def field_J(machine: Machine, current_A: float) -> float:

@@ -52,7 +52,7 @@ def pool_line(path: Path) -> str:
     data = scaling.data
     lsb_rpm = float(SPEED_LSB_RPM) * 2.0**scaling.exponents.speed
     values = (data.speed_base_rpm, data.torque_rated_Nm, data.parameters["torque_max_Nm"], data.over_speed_rpm,
-              data.bus_over_voltage_V, data.bus_under_voltage_V, data.current_trip_A, lsb_rpm,
+              data.over_voltage_V, data.under_voltage_V, data.current_trip_A, lsb_rpm,
               scaling.speed_reference_max * lsb_rpm, 2.0**(scaling.exponents.torque - TORQUE_COMMAND_FRACTION_BITS),
               2.0**(scaling.exponents.current - CURRENT_FRACTION_BITS),
               2.0**(scaling.exponents.voltage - VOLTAGE_FRACTION_BITS))

@@ -32,9 +32,9 @@ PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_
 NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
 RESERVE = {"torque_reserve_Nm": 8.0}
 SWITCHES = {
-    "observer fixed": {"observer_waking": 0}, "observer waking": {"observer_waking": 1},
+    "observer fixed": {"observer_scheduling": 0}, "observer scheduled": {"observer_scheduling": 1},
     "sharing off": {"torque_sharing": 0}, "sharing on": {"torque_sharing": 1},
-    "trim off": {"angle_trim": 0}, "trim on": {"angle_trim": 1},
+    "angle adaptation off": {"angle_adaptation": 0}, "angle adaptation on": {"angle_adaptation": 1},
 }  # fmt: skip
 """Optional parts of the controller salient, by condition."""
 

@@ -184,7 +184,7 @@ class _Subject:
 
     def rough_Nm(self, speeds_rpm: Sequence[float]) -> list[float]:
         """Largest torques in N m, roughly, within what the drive can be commanded."""
-        limits = Limits(self.data.parameters["current_limit_A"], self.data.bus_over_voltage_V,
+        limits = Limits(self.data.parameters["current_limit_A"], self.data.over_voltage_V,
                         self.machine.supply_voltage_V)
         return [min(float(torque_Nm), self.torque_max_Nm)
                 for torque_Nm in rough_torque_Nm(self.machine, speeds_rpm, limits)]
@@ -388,7 +388,7 @@ def _machine(name: str) -> Machine:
 def _limits(scenario: Scenario) -> Limits:
     machine = _machine(scenario.machine)
     parameters = {**derive(machine).parameters, **scenario.parameters}
-    return Limits(parameters["current_limit_A"], parameters["bus_over_voltage_V"],
+    return Limits(parameters["current_limit_A"], parameters["over_voltage_V"],
                   scenario.bench.get("supply_voltage_V", machine.supply_voltage_V))
 
 
