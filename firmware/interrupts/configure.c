@@ -497,7 +497,7 @@ static void set_estimators(control_parameters_t *control, const source_t *from) 
     const observer_bandwidth_parameters_t *bandwidth = &control->bandwidth;
     const observer_bandwidth_stage_t *moving = &bandwidth->stage[bandwidth->schedule.moving_stage];
     control->misalignment = misalignment_configure(&(misalignment_settings_t){
-        .rate_1_s = values[PARAMETER_ANGLE_ADAPTATION] != 0 ? values[PARAMETER_ANGLE_ADAPTATION_RATE_1_S] : 0,
+        .rate_1_s = values[PARAMETER_ANGLE_ADAPTATION] != 0 ? values[PARAMETER_ANGLE_ADAPTATION_1_S] : 0,
         .control_rate_hz = rate_hz,
         .periods_per_update = DEFERRED_LEARNING_PERIODS,
         .periods_per_common_update = DEFERRED_COMMON_PERIODS,

@@ -33,7 +33,7 @@ misalignment_parameters_t parameters_of(int32_t rate_1_s,
     p.values[PARAMETER_CONTROLLER] = controller;
     p.values[PARAMETER_ANGLE_ADAPTATION] = rate_1_s != 0;
     if (rate_1_s != 0) {
-        p.values[PARAMETER_ANGLE_ADAPTATION_RATE_1_S] = rate_1_s;
+        p.values[PARAMETER_ANGLE_ADAPTATION_1_S] = rate_1_s;
     }
     return configure_control(&p, &machine_tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ).misalignment;
 }

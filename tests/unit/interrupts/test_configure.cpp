@@ -221,7 +221,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
          1.0);
     near("return", c.conduction.retract_step_q30, 1.0 * DEFERRED_CONDUCTION_PERIODS / rate_hz * fixed_point::Q30, 1.0);
 
-    const double learn_1_s = p.values[PARAMETER_ANGLE_ADAPTATION] == 1 ? v(PARAMETER_ANGLE_ADAPTATION_RATE_1_S) : 0.0;
+    const double learn_1_s = p.values[PARAMETER_ANGLE_ADAPTATION] == 1 ? v(PARAMETER_ANGLE_ADAPTATION_1_S) : 0.0;
     const double turn_rate_hz = std::floor(rate_hz / DEFERRED_LEARNING_PERIODS / machine_tables.phases);
     near("misalignment rate", c.misalignment.rate_q30, learn_1_s / turn_rate_hz * fixed_point::Q30, 1.0);
     near("common misalignment rate", c.misalignment.common_rate_q30,

@@ -63,7 +63,7 @@ ParameterName = Literal[
     "torque_reserve_Nm",
     "flux_observer_gain",
     "angle_adaptation",
-    "angle_adaptation_rate_1_s",
+    "angle_adaptation_1_s",
     "observer_moving_rad_s",
     "periodic_load",
     "torque_slew_rate_Nm_s",
