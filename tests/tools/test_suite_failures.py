@@ -186,3 +186,25 @@ def test_torque_reference_is_a_change_in_torque_mode_only(make_bench):
     found = changes(bench, bench.time_s)
     assert any("DRIVE_STATUS.mode: speed -> torque" in change for change in found)
     assert any(re.search(r"DRIVE_TORQUE\.torque_reference_Nm: .* -> 1\.996", change) for change in found), found
+
+
+MANY = """
+import gc
+import pytest
+from salient.bench.session import Session
+
+@pytest.mark.parametrize("number", range(8))
+def test_passes_or_fails(bench, number):
+    gc.collect()
+    assert sum(isinstance(one, Session) for one in gc.get_objects()) == 1
+    bench.run_for(0.01)
+    assert number % 4 != 3, "of the suite"
+"""
+
+
+def test_a_suite_keeps_the_bench_of_the_present_test_only(tmp_path):
+    (tmp_path / "test_many.py").write_text(MANY)
+    result = subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=line", tmp_path],
+                            cwd=tmp_path, capture_output=True, text=True)
+    assert "2 failed, 6 passed" in result.stdout, result.stdout
+    assert result.stdout.count("- AssertionError: of the suite") == 2, result.stdout

@@ -252,9 +252,10 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]
         except Exception as error:  # must not hide the failure of the test
             lines = [f"nothing saved: {error!r}"]
         report.sections.append(("salient bench", "\n".join(lines)))
-    if call.when == "teardown":
-        for recording in item.stash.get(_state_key, _State()).recordings.values():
+    if call.when == "teardown" and _state_key in item.stash:
+        for recording in item.stash[_state_key].recordings.values():
             recording.unlink(missing_ok=True)
+        del item.stash[_state_key]  # pytest keeps the items of a run to its end: the benches would stay with their logs
 
 
 def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
