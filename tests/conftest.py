@@ -2,18 +2,61 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from salient.__main__ import main
-from salient.paths import ROOT
+from salient.builder import run_commands
+from salient.config import TARGET_BUILDS, WASM_BUILD
+from salient.paths import BUILD, ROOT
+
+BUILDS = {
+    "hil": {"host": ["salient_host"]},
+    "plant": {"host": []},
+    "tools": {"host": [], WASM_BUILD: []},
+    "target": {preset: [] for preset in ("host", *TARGET_BUILDS, WASM_BUILD)},
+}
+"""Folder of tests: the presets that it runs, each with its targets, none for all."""
 
 # Tests of the benchmark use the reference model of the plant, too.
 sys.path.append(str(ROOT / "tests" / "plant"))
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Brings the builds up to date that the selected folders run; ends the session when one fails. With a drive that
+    runs already, or in the VM, nothing is built."""
+    config = session.config
+    if hasattr(config, "workerinput") or config.option.collectonly or config.getoption("--salient-can") != "local":
+        return
+    selected = [Path(argument.partition("::")[0]).absolute() for argument in config.args]
+    with (BUILD / "launcher.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # no two commands build at once
+        for preset, targets in builds_of(selected).items():
+            commands = [["cmake", "--build", "--preset", preset, *(["--target", *targets] if targets else [])]]
+            if not (BUILD / preset / "build.ninja").exists():
+                commands.insert(0, ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="])
+            log = BUILD / f"{preset}.log"
+            if not run_commands(commands, ROOT, log, partial(print, f"building {BUILD.name}/{preset}", flush=True)):
+                print(log.read_text(encoding="utf-8", errors="replace")[-4000:])
+                pytest.exit(f"building {preset} failed; `tools/salient test` installs the compilers that it needs", 1)
+
+
+def builds_of(selected: Sequence[Path]) -> dict[str, list[str]]:
+    """Presets, with their targets, that selected files and folders run."""
+    found: dict[str, list[str]] = {}
+    for name, presets in BUILDS.items():
+        folder = ROOT / "tests" / name
+        if any(path.is_relative_to(folder) or folder.is_relative_to(path) for path in selected):
+            for preset, targets in presets.items():
+                former = found.setdefault(preset, targets)
+                found[preset] = sorted({*former, *targets}) if former and targets else []
+    return found
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"
@@ -132,24 +131,15 @@ def _sanitize() -> Count:
 
 def _python_tests(names: list[str]) -> Count:
     """One run of pytest for the folders of these names, with a line of each."""
-    total = Count()
-    folders = []
-    built: set[str] = set()
     for name in names:
         _print(f"--- {name}: {PYTHON_TESTS[name]}")
-        builds = [_one(build_preset(preset)) for preset in PYTHON_TEST_BUILDS.get(name, ()) if preset not in built]
-        built.update(PYTHON_TEST_BUILDS.get(name, ()))
-        for build in builds:
-            total += build
-        if not any(build.failed for build in builds):
-            folders.append(TESTS / name)
+    folders = [TESTS / name for name in names]
     if not folders:
-        return total
+        return Count()
     count = _pytest("python", *folders)
     for folder in folders:
         _print(f"--- {folder.name}: {_read_report(RESULTS / 'python.xml', f'tests.{folder.name}.')}")
-    total += count
-    return total
+    return count
 
 
 def _socketcan() -> Count:
@@ -171,8 +161,6 @@ PYTHON_TESTS = {
     "target": "the firmware for Cortex-M4 (compiled in three ways) and RV32: symbols and size checked, run in QEMU.",
 }
 """Folder of tests: its claim. Last the folder with the longest file, whose tests use every core themselves."""
-PYTHON_TEST_BUILDS = {"tools": (WASM_BUILD,), "target": (*TARGET_BUILDS, WASM_BUILD)}
-"""Folder of tests: the presets that it needs beside the host."""
 
 
 # --- parts of steps -------------------------------------------------------------------------------------------------
