@@ -21,6 +21,7 @@
 
 #include "campaign/branch.h"
 #include "campaign/run.h"
+#include "campaign/world_draw.h"
 #include "host/host_drive.h"
 
 #define EXIT_USAGE 2

@@ -28,6 +28,11 @@ static inline double seeded_between(uint64_t seed, uint64_t stream, uint64_t ind
     return low + (high - low) * seeded_unit(seed, stream, index);
 }
 
+/* low <= number < high, of which the logarithm is uniform. */
+static inline double seeded_logarithmic(uint64_t seed, uint64_t stream, uint64_t index, double low, double high) {
+    return exp(seeded_between(seed, stream, index, log(low), log(high)));
+}
+
 /* 0 .. count - 1. */
 static inline unsigned seeded_below(uint64_t seed, uint64_t stream, uint64_t index, unsigned count) {
     return (unsigned)(seeded_bits(seed, stream, index) % count);

@@ -1,6 +1,4 @@
-/* A world from a seed: machine, board, client's script and events.
- *
- * Swarm testing: each seed switches most kinds of events off (A. Groce et al., "Swarm testing", ISSTA 2012). */
+/* A world: machine, board, client's script and events. */
 #ifndef CAMPAIGN_WORLD_H
 #define CAMPAIGN_WORLD_H
 
@@ -85,9 +83,11 @@ typedef struct {
     uint64_t kept; /* bit n: event n happens */
 } world_t;
 
-/* Draws the world of a seed: with faults, or a healthy one of healthy_s seconds. */
-void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
-void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
+/* Adds an event; NULL: there is no room. */
+world_event_t *world_add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us);
+
+/* Adds a bench variable that has a value from begin to end, and another one after it; end 0: it lasts. */
+void world_add_set(world_t *world, unsigned variable, double value, double after, uint64_t begin_us, uint64_t end_us);
 
 /* The event when it is kept and has begun at a time, UINT64_MAX: ever; otherwise NULL. */
 const world_event_t *world_begun(const world_t *world, unsigned event, uint64_t time_us);

@@ -1,9 +1,11 @@
+#include "campaign/world_faults.h"
+
 #include <math.h>
 #include <stddef.h>
 
 #include "bench_variables.h"
 #include "campaign/seeded.h"
-#include "campaign/world_draw.h"
+#include "campaign/world_streams.h"
 #include "fault_kinds.h"
 
 #define FAULT_DRAWS 8     /* random numbers of a kind of fault */
@@ -157,7 +159,7 @@ static void draw_fault(world_t *world, unsigned kind, uint64_t last_us) {
     /* A fifth is there before the start. */
     const bool early = seeded_unit(seed, STREAM_FAULT, base) < 0.2;
     const uint64_t begin_us = early ? 0 : (uint64_t)seeded_between(seed, STREAM_FAULT, base + 1, 5e3, (double)last_us);
-    uint64_t end_us = begin_us + 20 + (uint64_t)world_logarithmic(seed, STREAM_FAULT, base + 2, 30.0, 2e5);
+    uint64_t end_us = begin_us + 20 + (uint64_t)seeded_logarithmic(seed, STREAM_FAULT, base + 2, 30.0, 2e5);
     const bool remains = seeded_unit(seed, STREAM_FAULT, base + 6) < REMAINING_SHARE;
     end_us = end_us < last_us && !remains ? end_us : last_us;
     world_event_t *event = end_us > begin_us ? world_add(world, WORLD_FAULT, begin_us, end_us) : NULL;
@@ -186,7 +188,7 @@ void world_draw_other_faults(world_t *world, uint64_t last_us) {
     } all[] = {
         {BENCH_VARIABLE_STO_1, 1, 0},
         {BENCH_VARIABLE_STO_2, 1, 0},
-        {BENCH_VARIABLE_INTERRUPT_TIME_US, world_logarithmic(seed, STREAM_GATES, 90, 5.0, 5000.0), 0},
+        {BENCH_VARIABLE_INTERRUPT_TIME_US, seeded_logarithmic(seed, STREAM_GATES, 90, 5.0, 5000.0), 0},
         {BENCH_VARIABLE_BABBLE_LOAD_PERCENT, seeded_between(seed, STREAM_BUS, 90, 20.0, 100.0), 0},
         {BENCH_VARIABLE_BUS_CONNECTION, 0, 1},
         {BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER, 256, 0},
@@ -198,7 +200,7 @@ void world_draw_other_faults(world_t *world, uint64_t last_us) {
             continue;
         }
         const uint64_t begin_us = (uint64_t)seeded_between(seed, STREAM_GATES, 20 + i, 2e3, (double)last_us);
-        uint64_t end_us = begin_us + (uint64_t)world_logarithmic(seed, STREAM_GATES, 40 + i, 100.0, 3e5);
+        uint64_t end_us = begin_us + (uint64_t)seeded_logarithmic(seed, STREAM_GATES, 40 + i, 100.0, 3e5);
         end_us = end_us < last_us ? end_us : last_us;
         if (all[i].variable == BENCH_VARIABLE_FRAME_FAULT) {
             world_add_set(world, BENCH_VARIABLE_FRAME_FAULT_PER_MILLE,

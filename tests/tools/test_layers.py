@@ -29,9 +29,6 @@ FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
 JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h",
                                "emulator/qemu/image/main.c"}
 
-CIRCLES_TO_BE_SPLIT = "emulator/campaign/world"
-"""Modules that may still call each other in a circle."""
-
 PYTHON_LAYERS = (
     "salient", "salient.errors", "salient.paths", "salient.progress", "salient.config", "salient.version",
     "salient.dbc", "salient.toml_file", "salient.c_limits",
@@ -178,10 +175,7 @@ def test_calls_follow_the_layers() -> None:
 
 def test_no_modules_call_each_other_in_a_circle() -> None:
     graph = modules(calls(ROOT))
-    split = {module: {target for target in targets if not target.startswith(CIRCLES_TO_BE_SPLIT)}
-             for module, targets in graph.items()}
-    assert circle(split) == []
-    assert circle(graph) != [], f"{CIRCLES_TO_BE_SPLIT}: an exception that is not needed"
+    assert circle(graph) == []
 
 
 def test_imports_follow_the_layers() -> None:
