@@ -109,31 +109,45 @@ static void publish(commands_t *commands, command_t *command) {
     }
 }
 
-static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
-                                        uint32_t time_us, command_t *command) {
+/* Follows the sequence of a sender's commands. False: the frame is not the next one of the sender that commands; its
+ * rejection is written. */
+static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame, uint32_t time_us,
+                          commands_frame_t *rejection) {
     commands_counters_t *counters = &commands->counters;
-    if (frame->length != DRIVE_COMMAND_LENGTH) {
-        return reject_command(commands, &counters->wrong_length);
-    }
     const uint16_t data_id_of_node = (uint16_t)(data_id + commands->data_id_offset);
     commands->receiver.locked =
         commands->arming.armed || time_us - commands->last_received_us < COMMANDS_SENDER_LOST_US;
     switch (e2e_check(&commands->receiver, data_id_of_node, frame->data, frame->length)) {
     case E2E_ACCEPTED:
         commands->contested = commands->contested && time_us - commands->contested_us < COMMANDS_SENDER_LOST_US;
-        break;
+        return true;
     case E2E_RESYNCHRONISED:
         commands->contested = false;
-        break;
+        return true;
     case E2E_WRONG_CHECKSUM:
-        return reject_command(commands, &counters->wrong_checksum);
+        *rejection = reject_command(commands, &counters->wrong_checksum);
+        return false;
     case E2E_REPEATED: /* duplicated on the way, no evidence of a second sender */
-        return reject(&counters->wrong_counter);
+        *rejection = reject(&counters->wrong_counter);
+        return false;
     case E2E_WRONG_SEQUENCE:
     default:
         commands->contested = true;
         commands->contested_us = time_us;
-        return reject_command(commands, &counters->wrong_counter);
+        *rejection = reject_command(commands, &counters->wrong_counter);
+        return false;
+    }
+}
+
+static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
+                                        uint32_t time_us, command_t *command) {
+    commands_counters_t *counters = &commands->counters;
+    if (frame->length != DRIVE_COMMAND_LENGTH) {
+        return reject_command(commands, &counters->wrong_length);
+    }
+    commands_frame_t rejection;
+    if (!follow_sender(commands, data_id, frame, time_us, &rejection)) {
+        return rejection;
     }
     commands->last_received_us = time_us;
     command_t requested = commands->requested;

@@ -173,6 +173,27 @@ static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *
     return vanished || none;
 }
 
+/* A difference on one side over TURN_MIN is one that an angle may explain: judge_doubts. */
+static void follow_side(const flux_residual_t *residual, phase_evidence_t *state, unsigned index, int side) {
+    phase_evidence_phase_t *phase_state = &state->phase[index];
+    phase_state->turned = side == 0 || side != phase_state->side
+                              ? 0
+                              : fixed_saturate((int64_t)phase_state->turned + fixed_abs(residual->step));
+    phase_state->side = (int8_t)side;
+    if (phase_state->turned >= TURN_MIN) {
+        state->doubted |= 1u << index;
+        state->doubted_side = side;
+        state->quiet_turned_q24 = 0;
+    }
+}
+
+/* True when a phase has had less flux linkage than any angle explains in OPEN_SAMPLES samples in succession. */
+static bool stays_open(phase_evidence_phase_t *phase_state, bool too_little) {
+    const unsigned samples = phase_state->open_samples + (phase_state->open_samples < OPEN_SAMPLES);
+    phase_state->open_samples = (uint8_t)(too_little ? samples : 0);
+    return phase_state->open_samples >= OPEN_SAMPLES;
+}
+
 static void check_phase(const flux_residual_t *residual, phase_evidence_t *state, unsigned index,
                         flux_evidence_t *evidence) {
     const bool is_lost = (residual->sample.lost_phases >> index & 1u) != 0;
@@ -185,19 +206,9 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
         difference = compare(residual, phase_state, index, &side);
         state->agreed |= (uint32_t)(difference == AGREES && !phase->small) << index;
     }
+    follow_side(residual, state, index, side);
     const bool beyond = difference == BEYOND_ANGLES;
-    phase_state->turned = side == 0 || side != phase_state->side
-                              ? 0
-                              : fixed_saturate((int64_t)phase_state->turned + fixed_abs(residual->step));
-    phase_state->side = (int8_t)side;
-    if (phase_state->turned >= TURN_MIN) {
-        state->doubted |= 1u << index;
-        state->doubted_side = side;
-        state->quiet_turned_q24 = 0;
-    }
-    phase_state->open_samples =
-        beyond && side > 0 ? (uint8_t)(phase_state->open_samples + (phase_state->open_samples < OPEN_SAMPLES)) : 0;
-    evidence->too_little |= (uint32_t)(phase_state->open_samples >= OPEN_SAMPLES) << index;
+    evidence->too_little |= (uint32_t)stays_open(phase_state, beyond && side > 0) << index;
     const bool more = phase->current_q9 > 2 * residual->offset_q9;
     check_excess(residual, phase_state, index, (phase->at_rest && more) || remains || (beyond && side < 0), evidence);
     const bool missing = is_missing(residual, phase_state, index);
