@@ -28,6 +28,11 @@
 #include "fixed/compiler.h"
 #include "hal.h"
 
+/* Generation: resets of a run in the lower half, of the observer in the upper one. */
+#define DEFERRED_RUN_MASK UINT32_C(0x0000FFFF)
+#define DEFERRED_OBSERVER_MASK UINT32_C(0xFFFF0000)
+#define DEFERRED_OBSERVER_STEP UINT32_C(0x00010000)
+
 /* Values of one control period. */
 typedef struct {
     uint32_t generation;
