@@ -3,10 +3,8 @@
 #include "control/phase_map.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
+#include "interrupts/configure_torque.h"
 #include "interrupts/deferred.h"
-
-/* Reference rate of the BP-PID gains: the torque change per period scales with the period. */
-#define GAIN_RATE_HZ 40000
 
 bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz) {
     return (control_rate_hz == 20000 || control_rate_hz == 40000 || control_rate_hz == 50000 ||
@@ -15,20 +13,11 @@ bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz) {
            timer_clock_hz % (2u * control_rate_hz) == 0;
 }
 
-/* Laws and features of a controller. */
-typedef struct {
-    speed_law_t speed_law;
-    torque_law_t torque_law;
-    bool four_quadrant;         /* false: motors forwards only */
-    bool schedules_bandwidth;   /* of the observer; false: fixed bandwidth */
-    bool may_interleave_pulses; /* by the parameter `pulses_per_period` */
-} controller_t;
-
 /* The only place that distinguishes the controllers. */
-static controller_t controller_from(const int32_t *values) {
+static configure_controller_t controller_from(const int32_t *values) {
     switch ((drive_controller_t)values[PARAMETER_CONTROLLER]) {
     case DRIVE_CONTROLLER_SALIENT:
-        return (controller_t){
+        return (configure_controller_t){
             .speed_law = SPEED_LAW_SMC,
             .torque_law = TORQUE_LAW_PREDICTIVE,
             .four_quadrant = true,
@@ -36,7 +25,7 @@ static controller_t controller_from(const int32_t *values) {
             .may_interleave_pulses = true,
         };
     case DRIVE_CONTROLLER_PAPER:
-        return (controller_t){
+        return (configure_controller_t){
             .speed_law = SPEED_LAW_SMC,
             .torque_law = values[PARAMETER_BP_MODE] == BP_PID_OFF ? TORQUE_LAW_HYSTERESIS : TORQUE_LAW_DUTY,
             .schedules_bandwidth = true,
@@ -44,22 +33,8 @@ static controller_t controller_from(const int32_t *values) {
         };
     case DRIVE_CONTROLLER_TRADITIONAL:
     default:
-        return (controller_t){.speed_law = SPEED_LAW_PI, .torque_law = TORQUE_LAW_HYSTERESIS};
+        return (configure_controller_t){.speed_law = SPEED_LAW_PI, .torque_law = TORQUE_LAW_HYSTERESIS};
     }
-}
-
-/* pi / 30: r/min to rad/s. */
-#define PI_30_Q37 INT64_C(14392573551)
-
-/* rad/s with 22 fraction bits from whole r/min, any value: Q9.22 up to 4889 r/min. */
-static int64_t speed_q22_from_rpm(int32_t rpm) {
-    return fixed_shift(rpm * PI_30_Q37, 15);
-}
-
-/* 2^-32 electrical revolution from electrical degrees in Q7; 360 degrees saturate just below one revolution. */
-static uint32_t angle_from_degrees(int32_t degrees_q7) {
-    const int64_t angle = fixed_divide((int64_t)degrees_q7 << 32, 360 * 128);
-    return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
 }
 
 /* Value of one count in Q18 for a full scale below 2^16; exact. */
@@ -83,12 +58,6 @@ static int32_t ramp_q22(int32_t rpm_s, uint32_t control_rate_hz) {
 static int32_t speed_reference_max_q22(const torque_mode_parameters_t *torque_mode, const machine_tables_t *tables) {
     const int32_t fold_back_q22 = torque_mode->speed_end_q22 - torque_mode->fold_back_range_q22 + 2;
     return fixed_min(fold_back_q22, tables->speed_max_q22);
-}
-
-/* Duty per scaled error from duty per N m at GAIN_RATE_HZ, both Q15. */
-static int32_t pid_scale_q15(int32_t per_Nm_q15, int32_t error_scale_q24, uint32_t control_rate_hz) {
-    const int64_t scaled_q15 = fixed_shift((int64_t)per_Nm_q15 * error_scale_q24, 24);
-    return fixed_clamp(fixed_saturate(fixed_divide(scaled_q15 * control_rate_hz, GAIN_RATE_HZ)), 0, 4 << 15);
 }
 
 /* Braking torque of drive and load together, N m, that the largest deceleration assumes. */
@@ -156,61 +125,6 @@ static flux_monitor_parameters_t flux_monitor_from(const control_parameters_t *c
     };
 }
 
-/* Largest current, A, Q7.9, from which full voltage for some tenths of a control period drives no phase above the trip,
- * at any angle. By the flux linkage: a saturated phase has less inductance than at the unaligned position, where the
- * flux linkage of a voltage is that of the current which it drives. */
-static int32_t highest_before_trip_q9(const int32_t *values, const machine_tables_t *tables, uint32_t control_rate_hz,
-                                      unsigned tenths) {
-    const int32_t trip_q9 = values[PARAMETER_CURRENT_TRIP_A];
-    const int64_t rise_q9 =
-        fixed_divide(((int64_t)tables->current_slew_rate_A_s << 9) * tenths, (int64_t)control_rate_hz * 10);
-    const int32_t rise_q29 = phase_map_flux_q29(tables, 0, fixed_saturate(rise_q9));
-    int32_t highest_q9 = trip_q9;
-    for (unsigned row = 0; row < MACHINE_ROWS; row++) {
-        const uint32_t distance = tables->row[row].start < HALF_REV ? tables->row[row].start : HALF_REV - 1u;
-        const int32_t room_q29 = phase_map_flux_q29(tables, distance, trip_q9) - rise_q29;
-        int32_t allowed_q9 = 0;
-        for (int32_t bit = 1 << 15; bit > 0; bit >>= 1) {
-            const int32_t trial_q9 = allowed_q9 | bit;
-            if (trial_q9 <= highest_q9 && phase_map_flux_q29(tables, distance, trial_q9) <= room_q29) {
-                allowed_q9 = trial_q9;
-            }
-        }
-        highest_q9 = allowed_q9;
-    }
-    return highest_q9;
-}
-
-/* A current that exceeds its limit rises for two periods more, one until the sample and one until the new state acts;
- * a tenth of it is the margin for the machine's scatter. Hysteresis switches a phase on for whole periods. */
-static void limit_currents(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
-                           uint32_t control_rate_hz) {
-    const int32_t limit_q9 = values[PARAMETER_CURRENT_LIMIT_A];
-    const int32_t two_periods_q9 = highest_before_trip_q9(values, tables, control_rate_hz, 22);
-    const int32_t one_period_q9 = highest_before_trip_q9(values, tables, control_rate_hz, 11);
-    const int32_t period_q9 = one_period_q9 > two_periods_q9 ? one_period_q9 - two_periods_q9 : 1;
-    const int32_t ceiling_q9 = one_period_q9 + period_q9;
-    control->hysteresis.current_limit_q9 = fixed_min(two_periods_q9, limit_q9);
-    control->hysteresis.generating_limit_q9 = two_periods_q9;
-    control->hysteresis.generating_slope_q19 =
-        fixed_saturate(fixed_divide((int64_t)(values[PARAMETER_CURRENT_TRIP_A] - two_periods_q9) << 32,
-                                    speed_q22_from_rpm(values[PARAMETER_OVER_SPEED_RPM])));
-    control->duty.current_limit_q9 = limit_q9;
-    control->duty.current_ceiling_q9 = fixed_max(ceiling_q9, limit_q9);
-    control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
-}
-
-/* A period's flux linkage at full voltage is that of the rise of the current at the unaligned position. */
-static void set_reference_point(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
-                                uint32_t control_rate_hz) {
-    const int64_t rise_q9 = fixed_divide((int64_t)tables->current_slew_rate_A_s << 9, control_rate_hz);
-    const uint32_t middle =
-        angle_from_degrees((values[PARAMETER_TURN_ON_ANGLE_DEG] + values[PARAMETER_TURN_OFF_ANGLE_DEG]) / 2);
-    const int32_t flux_q29 =
-        phase_map_flux_q29(tables, 0, fixed_clamp(fixed_saturate(rise_q9), 1, PHASE_MAP_CURRENT_MAX_Q9));
-    pwm_ditc_set_reference_point(&control->duty, tables, middle, flux_q29 > 0 ? flux_q29 : 1);
-}
-
 static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, bool schedules_bandwidth,
                                                       uint32_t control_rate_hz, unsigned encoder_bits) {
     const uint32_t steady_rad_s =
@@ -225,123 +139,6 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, boo
         .inertia_q30 = values[PARAMETER_INERTIA_KG_M2],
         .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
     });
-}
-
-static bp_pid_parameters_t bp_pid_from(const int32_t *values, uint32_t control_rate_hz) {
-    const int32_t scale_q24 = values[PARAMETER_BP_ERROR_SCALE_NM];
-    return (bp_pid_parameters_t){
-        .mode = (bp_pid_mode_t)values[PARAMETER_BP_MODE],
-        .seed = (uint32_t)values[PARAMETER_BP_SEED],
-        .error_scale_inverse_q24 = fixed_saturate(fixed_divide((int64_t)1 << 48, scale_q24)),
-        .scale_q28 = {pid_scale_q15(values[PARAMETER_BP_KP_MAX], scale_q24, control_rate_hz) << 13,
-                      pid_scale_q15(values[PARAMETER_BP_KI_MAX], scale_q24, control_rate_hz) << 13,
-                      pid_scale_q15(values[PARAMETER_BP_KD_MAX], scale_q24, control_rate_hz) << 13},
-        .network = {.learning_rate_q15 = values[PARAMETER_BP_LEARNING_RATE] >> 13,
-                    .momentum_q32 = values[PARAMETER_BP_MOMENTUM] << 4},
-    };
-}
-
-/* Windows of the machine from its tables. */
-static bool own_windows(const int32_t *values) {
-    return values[PARAMETER_SHARE_ON_ANGLE_DEG] < 180 << 7;
-}
-
-/* Widest window of the tables, of the largest torque. */
-static torque_sharing_parameters_t own_sharing_from(const int32_t *values, const machine_tables_t *tables) {
-    const machine_sharing_window_t *window = &tables->sharing[CONDUCTION_MOTORING][0][MACHINE_SHARING_PARTS - 1];
-    return (torque_sharing_parameters_t){
-        .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
-        .stroke = commutation_stroke(tables->phases),
-        .turn_on = HALF_REV + ((uint32_t)window->on << 16),
-        .turn_off = HALF_REV + ((uint32_t)window->off << 16),
-    };
-}
-
-static torque_sharing_parameters_t sharing_from(const int32_t *values, const machine_tables_t *tables) {
-    const uint32_t stroke = commutation_stroke(tables->phases);
-    if (own_windows(values)) {
-        return own_sharing_from(values, tables);
-    }
-    const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
-    const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
-    const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_ADVANCE_DEG]);
-    const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_ADVANCE_DEG]);
-    /* Windows overlap by at least 2 degrees, advanced or not; smaller settings are widened. */
-    const uint32_t least = stroke + angle_from_degrees(2 << 7);
-    const uint32_t width = fixed_max_u32(turn_off - turn_on, least);
-    const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
-    return (torque_sharing_parameters_t){
-        .overlapping = values[PARAMETER_TORQUE_SHARING] != 0,
-        .stroke = stroke,
-        .turn_on = turn_on,
-        .turn_off = turn_on + width,
-        .turn_on_advance = on_early,
-        .turn_off_advance = off_early - (narrowing > width - least ? narrowing - (width - least) : 0),
-    };
-}
-
-/* The fields of the phases hardly raise a large DC link: a 32nd of the over-voltage threshold is the least range. */
-static int32_t fold_back_range_q6(int32_t over_voltage_q6, int32_t range_q6) {
-    return fixed_max(range_q6, over_voltage_q6 / 32);
-}
-
-static conduction_parameters_t conduction_from(const int32_t *values, const machine_tables_t *tables,
-                                               uint32_t control_rate_hz, int32_t torque_min_q24) {
-    const unsigned phases = tables->phases;
-    const torque_sharing_parameters_t sharing = sharing_from(values, tables);
-    const torque_sharing_window_t base_window = torque_sharing_window(&sharing, 0);
-    const int32_t over_voltage_q6 = values[PARAMETER_OVER_VOLTAGE_V];
-    const int32_t range_q6 = fold_back_range_q6(over_voltage_q6, tables->fold_back_q6);
-    const int32_t mean_range_q6 = fold_back_range_q6(over_voltage_q6, tables->mean_fold_back_q6);
-    /* A chopper is to have something left to take. */
-    const int32_t end_q6 = fixed_min(range_q6 / 2, mean_range_q6 * 3 / 4);
-    /* Twice the largest braking torque: a larger one would hardly leave a range. */
-    const int32_t link_torque_q24 =
-        fixed_clamp(values[PARAMETER_TORQUE_MAX_NM], 0,
-                    fixed_saturate((int64_t)tables->pulse[CONDUCTION_BRAKING][0].mean_torque << 17));
-    return (conduction_parameters_t){
-        .sharing = sharing,
-        .initial = conduction_initial(&base_window),
-        .own_windows = own_windows(values),
-        /* A reserve loads both halves against each other: turn-on of one leads into the other. */
-        .single_pulse = sharing.overlapping && values[PARAMETER_TORQUE_RESERVE_NM] == 0,
-        /* Not where the limit of each period reduces the torque at the voltage that their feedback holds. */
-        .longer_pulses = range_q6 + end_q6 < mean_range_q6 * 7 / 4 ? 3 : 0,
-        .torque_min_q24 = torque_min_q24,
-        .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
-        .advance_step_q30 =
-            (int32_t)fixed_divide(10 * DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
-        .retract_step_q30 =
-            (int32_t)fixed_divide(DEFERRED_CONDUCTION_PERIODS * ((int64_t)1 << 30), (int64_t)control_rate_hz),
-        .gain_per_step_q16 = (uint32_t)fixed_saturate(
-            fixed_divide((int64_t)phases * control_rate_hz << 30,
-                         (int64_t)DEFERRED_CONDUCTION_PERIODS * (values[PARAMETER_SMC_K] + 1))),
-        .braking_end_q6 = over_voltage_q6 - mean_range_q6 / 4,
-        .fold_back_range_q6 = mean_range_q6 - mean_range_q6 / 4 + 1,
-        .full_link_q6 = over_voltage_q6 - end_q6,
-        .full_link_range_q6 = range_q6 - end_q6 + 1,
-        .full_link_slope_q18 = link_torque_q24 / (range_q6 - end_q6 + 1),
-    };
-}
-
-static predictive_torque_parameters_t predictive_from(const int32_t *values, unsigned phases,
-                                                      uint32_t control_rate_hz) {
-    const int64_t rate = control_rate_hz;
-    const int32_t limit_column = values[PARAMETER_CURRENT_LIMIT_A] >> MACHINE_COLUMN_BITS;
-    return (predictive_torque_parameters_t){
-        .flux =
-            {
-                .gain_q30 = values[PARAMETER_FLUX_OBSERVER_GAIN] << 15,
-                .resistance_period_q40 =
-                    fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
-            },
-        .stroke = commutation_stroke(phases),
-        .period_q40 = (int32_t)fixed_divide((int64_t)1 << 40, rate),
-        .current_limit_q9 = values[PARAMETER_CURRENT_LIMIT_A],
-        .current_max_q9 = values[PARAMETER_CURRENT_LIMIT_A] + values[PARAMETER_CURRENT_LIMIT_A] / 64,
-        .column_max = fixed_clamp(limit_column + PHASE_CELL_REACH, 0, PHASE_CELL_COLUMN_MAX),
-        .reserve_q24 = values[PARAMETER_TORQUE_RESERVE_NM],
-    };
 }
 
 /* Far from the sliding surface the reaching law asks for the torque J k / epsilon. On a light machine that would be
@@ -394,19 +191,8 @@ static degraded_parameters_t degraded_from(const control_parameters_t *control, 
     };
 }
 
-/* Sources of the derived parameters. */
-typedef struct {
-    const int32_t *values; /* of the user's parameters */
-    const machine_tables_t *tables;
-    uint32_t control_rate_hz;
-    unsigned encoder_bits, adc_bits;
-    uint32_t timer_clock_hz;
-    controller_t controller;
-    int32_t torque_min_q24; /* of the drive, N m, Q7.24; the maximum is a parameter */
-} source_t;
-
 /* From counts and ticks to the units of the laws. */
-static void set_sampling(control_parameters_t *control, const source_t *from) {
+static void set_sampling(control_parameters_t *control, const configure_source_t *from) {
     const unsigned encoder_shift = 32u - from->encoder_bits;
     control->period_ticks = (uint16_t)(from->timer_clock_hz / (2u * from->control_rate_hz));
     control->encoder_shift = (uint8_t)encoder_shift;
@@ -429,7 +215,7 @@ static speed_smc_parameters_t smc_from(const int32_t *values) {
 }
 
 /* Observer, speed laws and torque mode. */
-static void set_speed_control(control_parameters_t *control, const source_t *from) {
+static void set_speed_control(control_parameters_t *control, const configure_source_t *from) {
     const int32_t *values = from->values;
     const uint32_t rate_hz = from->control_rate_hz;
     const int32_t torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM];
@@ -452,43 +238,8 @@ static void set_speed_control(control_parameters_t *control, const source_t *fro
     control->speed_reference_max_q22 = speed_reference_max_q22(&control->torque_mode, from->tables);
 }
 
-static pwm_ditc_parameters_t duty_from(const source_t *from) {
-    const int32_t *values = from->values;
-    return (pwm_ditc_parameters_t){
-        .pid = bp_pid_from(values, from->control_rate_hz),
-        .current_setpoints =
-            pwm_ditc_setpoints(from->tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
-        /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
-        .incoming_gain_q24 =
-            fixed_saturate(fixed_divide((int64_t)from->control_rate_hz << 23, from->tables->current_slew_rate_A_s)),
-        .band_outer_q24 = values[PARAMETER_BP_ASSIST_BAND_NM],
-    };
-}
-
-static void set_torque_control(control_parameters_t *control, const source_t *from) {
-    const int32_t *values = from->values;
-    control->torque_law = from->controller.torque_law;
-    control->interleaved_pwm = from->controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2;
-    control->commutation = commutation_configure(
-        &(commutation_angles_t){
-            .turn_on = angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
-            .turn_off = angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
-            .outgoing_off = angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
-        },
-        from->tables->phases, from->tables->rotor_poles);
-    control->hysteresis = (ditc_hysteresis_parameters_t){
-        .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
-        .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],
-    };
-    control->duty = duty_from(from);
-    control->predictive = predictive_from(values, from->tables->phases, from->control_rate_hz);
-    control->conduction = conduction_from(values, from->tables, from->control_rate_hz, from->torque_min_q24);
-    limit_currents(control, values, from->tables, from->control_rate_hz);
-    set_reference_point(control, values, from->tables, from->control_rate_hz);
-}
-
 /* Laws that learn or adapt during a run; after the others, whose parameters they need. */
-static void set_estimators(control_parameters_t *control, const source_t *from) {
+static void set_estimators(control_parameters_t *control, const configure_source_t *from) {
     const int32_t *values = from->values;
     const machine_tables_t *tables = from->tables;
     const uint32_t rate_hz = from->control_rate_hz;
@@ -542,7 +293,7 @@ static void set_estimators(control_parameters_t *control, const source_t *from) 
 }
 
 /* After the laws, whose parameters they need. */
-static void set_monitors(control_parameters_t *control, const source_t *from) {
+static void set_monitors(control_parameters_t *control, const configure_source_t *from) {
     control->protection =
         protection_from(from->values, control->observer.angle_step_q32, control->encoder_shift, from->control_rate_hz);
     control->degraded = degraded_from(control, from->values);
@@ -552,8 +303,8 @@ static void set_monitors(control_parameters_t *control, const source_t *from) {
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
                                        uint32_t timer_clock_hz) {
-    const controller_t controller = controller_from(parameters->values);
-    const source_t from = {
+    const configure_controller_t controller = controller_from(parameters->values);
+    const configure_source_t from = {
         .values = parameters->values,
         .tables = tables,
         .control_rate_hz = control_rate_hz,
@@ -566,7 +317,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     control_parameters_t control = {.controller = (drive_controller_t)parameters->values[PARAMETER_CONTROLLER]};
     set_sampling(&control, &from);
     set_speed_control(&control, &from);
-    set_torque_control(&control, &from);
+    configure_torque(&control, &from);
     set_estimators(&control, &from);
     set_monitors(&control, &from);
     return control;
