@@ -28,7 +28,8 @@
  *
  *   ceiling_gain (ceiling - current) - duty that acts until then
  *
- * which at a low control rate leaves it below the trip (configure_torque.c) and at a high one is above 1; above the limit 0.
+ * which at a low control rate leaves it below the trip (configure_torque.c) and at a high one is above 1; above the
+ * limit 0.
  */
 #ifndef CONTROL_PWM_DITC_H
 #define CONTROL_PWM_DITC_H
