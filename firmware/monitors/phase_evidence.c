@@ -189,7 +189,7 @@ static void follow_side(const flux_residual_t *residual, phase_evidence_t *state
 
 /* True when a phase has had less flux linkage than any angle explains in OPEN_SAMPLES samples in succession. */
 static bool stays_open(phase_evidence_phase_t *phase_state, bool too_little) {
-    const unsigned samples = phase_state->open_samples + (phase_state->open_samples < OPEN_SAMPLES);
+    const unsigned samples = phase_state->open_samples + (phase_state->open_samples < OPEN_SAMPLES ? 1u : 0u);
     phase_state->open_samples = (uint8_t)(too_little ? samples : 0);
     return phase_state->open_samples >= OPEN_SAMPLES;
 }
