@@ -11,12 +11,13 @@ import pytest
 
 from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.errors import UsageError
-from salient.target import worst_case
+from salient.target import long_run
 from salient.target.baseline import (
     BOUND_KEYS,
     FLASH_MAX_BYTES,
     RAM_MAX_BYTES,
     README,
+    long_run_metrics,
     profile_table,
     ram_needed,
     read,
@@ -24,7 +25,6 @@ from salient.target.baseline import (
     sizes,
     tables_of,
     with_table,
-    worst_case_metrics,
 )
 from salient.target.bound_report import bounds
 from salient.target.isr_profile import IsrProfile, measure
@@ -44,8 +44,8 @@ measure_once = lru_cache(measure)
 
 
 @lru_cache
-def known_worst_case(variant: str) -> IsrProfile:
-    return worst_case.profile(worst_case.read_input(worst_case.committed(variant)))
+def recorded_run(variant: str) -> IsrProfile:
+    return long_run.profile(long_run.read_input(long_run.committed(variant)))
 
 
 @pytest.mark.parametrize("build", TARGET_BUILDS)
@@ -69,26 +69,26 @@ def test_flash_and_ram_are_within_their_limits(build):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_isr_profile_of_the_experiments_matches_the_baseline(controller):
     measured, committed = measure_once(controller).metrics(), read()["interrupt"][controller]
-    assert measured["median"] <= measured["p99"] <= measured["max"] <= committed["worst_case"]
+    assert measured["median"] <= measured["p99"] <= measured["max"] <= committed["longest_run"]
     for name, value in measured.items():
         assert value == pytest.approx(committed[name], rel=COUNT_TOLERANCE), name
 
 
-@pytest.mark.parametrize("variant", worst_case.VARIANTS)
-def test_known_worst_case_matches_the_baseline(variant):
-    for name, measured in worst_case_metrics(known_worst_case(variant)).items():
+@pytest.mark.parametrize("variant", long_run.VARIANTS)
+def test_long_run_matches_the_baseline(variant):
+    for name, measured in long_run_metrics(recorded_run(variant)).items():
         assert measured == pytest.approx(read()["interrupt"][variant][name], rel=COUNT_TOLERANCE), name
 
 
 @pytest.mark.parametrize("build", BOUND_KEYS)
 def test_computed_bounds_match_the_baseline_and_exceed_every_run(build):
     for section, variants in bounds(build).items():
-        assert set(variants) == set(worst_case.VARIANTS)
+        assert set(variants) == set(long_run.VARIANTS)
         for variant, instructions in variants.items():
             committed = read()[section][variant]
             assert instructions == pytest.approx(committed[BOUND_KEYS[build]], rel=COUNT_TOLERANCE), variant
             if section == "interrupt" and build == "cortex-m4":
-                assert committed["worst_case"] <= instructions, variant
+                assert committed["longest_run"] <= instructions, variant
 
 
 def test_computed_bounds_on_the_cortex_m4_are_within_their_limits():
@@ -99,44 +99,22 @@ def test_computed_bounds_on_the_cortex_m4_are_within_their_limits():
         assert 0.5 * limit < found["interrupt"][variant] + found["deferred"][variant] <= limit, variant
 
 
-@pytest.mark.parametrize("variant", worst_case.VARIANTS)
+@pytest.mark.parametrize("variant", long_run.VARIANTS)
 def test_computed_bound_of_both_interrupts_exceeds_every_run(variant):
     control, deferred = read()["interrupt"][variant], read()["deferred"][variant]
-    assert control["worst_case"] < control["both"] <= control["computed_bound"] + deferred["computed_bound"]
+    assert control["longest_run"] < control["both"] <= control["computed_bound"] + deferred["computed_bound"]
 
 
 def test_table_shows_the_sum_of_both_bounds():
-    interrupt = {"salient": {"worst_case": 1200, "both": 1500, "computed_bound": 1300}}
+    interrupt = {"salient": {"longest_run": 1200, "both": 1500, "computed_bound": 1300}}
     table = profile_table(interrupt, {"salient": {"computed_bound": 654}})
     assert table.splitlines()[-1] == "| salient | – | – | – | 1200 | 1300 | 1500 | 1954 |"
 
 
-@pytest.mark.parametrize("variant", worst_case.VARIANTS)
-def test_no_directed_input_exceeds_the_known_worst_case(variant):
-    longest = [worst_case.longest_interrupt(given) for given in worst_case.directed(variant)]
-    assert len(longest) >= 12
-    assert max(longest) <= (1 + COUNT_TOLERANCE) * read()["interrupt"][variant]["worst_case"]
-    assert max(longest) > 0.7 * read()["interrupt"][variant]["worst_case"]
-
-
-def test_written_input_is_read_back_unchanged(tmp_path):
-    for given in worst_case.directed("salient"):
-        worst_case.write_input(tmp_path / "input.toml", given)
-        assert worst_case.read_input(tmp_path / "input.toml") == given
-
-
-def test_search_finds_longer_interrupts_than_it_starts_with():
-    short = worst_case.Input("saturating", "traditional", 1, 0.0, 2.0, (worst_case.Action(0.0, "off"),))
-    initial = worst_case.profile(short).metrics()["max"]
-    count, found = worst_case.search("traditional", [short], seconds=1.0, seed=1)
-    assert count > 1.2 * initial
-    assert worst_case.profile(found).metrics()["max"] == count
-
-
 def all_runs() -> Trace:
     """Trace of all runs of the same ELF image."""
-    variants = [variant for variant, of in worst_case.VARIANTS.items() if of.machine == "saturating"]
-    profiles = [*map(measure_once, CONTROLLERS), *map(known_worst_case, variants)]
+    variants = [variant for variant, of in long_run.VARIANTS.items() if of.machine == "saturating"]
+    profiles = [*map(measure_once, CONTROLLERS), *map(recorded_run, variants)]
     return functools.reduce(operator.add, (profile.trace for profile in profiles))
 
 

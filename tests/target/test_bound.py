@@ -11,7 +11,7 @@ from salient.bench.programs import image
 from salient.config import CONTROLLERS
 from salient.elf import ElfImage
 from salient.errors import UsageError
-from salient.target import worst_case
+from salient.target import long_run
 from salient.target.bound import Model
 from salient.target.bound_facts import FILE, Facts, Names, read_facts
 from salient.target.bound_report import bound, by_module
@@ -507,13 +507,13 @@ def test_names_have_the_values_of_image_and_headers(machine, phases):
 
 # --- the firmware ---------------------------------------------------------------------------------------------------
 
-RUNS = [*(("cortex-m4", variant) for variant in worst_case.VARIANTS), *(("rv32", variant) for variant in CONTROLLERS)]
+RUNS = [*(("cortex-m4", variant) for variant in long_run.VARIANTS), *(("rv32", variant) for variant in CONTROLLERS)]
 
 
 @pytest.mark.parametrize(("build", "variant"), RUNS)
 def test_every_run_is_a_path_within_the_facts_and_the_bound(variant, build):
     found = bound(variant, build)
-    profile = worst_case.profile(worst_case.read_input(worst_case.committed(variant)), build=build)
+    profile = long_run.profile(long_run.read_input(long_run.committed(variant)), build=build)
     addresses = [one.address for one in found.model.image.instructions()]
     longest = dict(zip(addresses, profile.trace.in_longest.tolist(), strict=True))
     assert sum(longest.values()) == profile.metrics()["max"] <= found.instructions
@@ -535,6 +535,6 @@ def test_longest_path_has_the_instructions_of_the_bound():
 
 def test_each_variant_has_facts_of_its_configuration():
     facts = read_facts(FILE)
-    known = {of.controller for of in worst_case.VARIANTS.values()}
+    known = {of.controller for of in long_run.VARIANTS.values()}
     named = [one.configurations for one in (*facts.loop, *facts.never, *facts.exclusive, *facts.at_most)]
     assert set().union(*(of for of in named if of is not None)) == known

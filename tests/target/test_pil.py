@@ -70,8 +70,8 @@ def test_fault_of_the_drive_is_exit_code_1(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("line", "message"), [
-    ([], "one of the arguments SCENARIO.toml --search --bound --figures is required"),
-    (["--search", "1", "--figures"], "--figures not allowed with argument --search"),
+    ([], "one of the arguments SCENARIO.toml --bound --figures is required"),
+    (["--bound", "--figures"], "--figures not allowed with argument --bound"),
     (["--bound", "salient", "--figures"], "--figures not allowed with argument --bound"),
     (["a.toml", "--figures"], "--figures not allowed with argument SCENARIO.toml"),
 ])

@@ -148,11 +148,6 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     pil.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/pil_NAME)")
     pil.add_argument("--target", type=_one_of(TARGETS[1:]), default=TARGETS[1], metavar="NAME",
                      help=f"{either(TARGETS[1:])} (default {TARGETS[1]})")
-    task.add_argument("--search", type=_positive, metavar="SECONDS",
-                     help="instead: search for control interrupts longer than the known worst cases, for this wall "
-                     "time per controller")
-    pil.add_argument("--seed", type=_option_type("seed"), default=DEFAULTS["seed"], metavar="N",
-                     help=f"seed of the search (default {DEFAULTS['seed']})")
     task.add_argument("--bound", nargs="?", const="all", metavar="VARIANT",
                       help="instead: compute the bound of the interrupts of the target from its machine code; with the "
                       "name of a variant its longest path by function")

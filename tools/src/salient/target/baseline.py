@@ -14,7 +14,7 @@ from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.paths import BUILD, ROOT
-from salient.target import worst_case
+from salient.target import long_run
 from salient.target.bound_report import bounds
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, RATES_HZ, fits
 from salient.target.isr_profile import IsrProfile, measure
@@ -63,21 +63,21 @@ def firmware_alone(build: str) -> Path:
 
 
 def measure_all() -> tuple[Baseline, dict[str, IsrProfile], dict[str, IsrProfile]]:
-    """The baseline, and the profiles that it is from: the two experiments by controller, the known worst cases by
+    """The baseline, and the profiles that it is from: the two experiments by controller, the long runs by
     variant."""
     profiles = {controller: measure(controller) for controller in CONTROLLERS}
-    worst = {variant: worst_case.profile(worst_case.read_input(worst_case.committed(variant)))
-             for variant in worst_case.VARIANTS}
+    longest = {variant: long_run.profile(long_run.read_input(long_run.committed(variant)))
+               for variant in long_run.VARIANTS}
     interrupts = {controller: profile.metrics() for controller, profile in profiles.items()}
-    for variant, profile in worst.items():
-        interrupts.setdefault(variant, {}).update(worst_case_metrics(profile))
+    for variant, profile in longest.items():
+        interrupts.setdefault(variant, {}).update(long_run_metrics(profile))
     measured = {"size": {build: sizes(build) for build in TARGET_BUILDS}, "interrupt": interrupts}
-    return with_bounds(measured), profiles, worst
+    return with_bounds(measured), profiles, longest
 
 
-def worst_case_metrics(profile: IsrProfile) -> dict[str, int]:
+def long_run_metrics(profile: IsrProfile) -> dict[str, int]:
     """Instructions of the longest control interrupt, and of the longest period with its deferred interrupt."""
-    return {"worst_case": profile.metrics()["max"], "both": profile.sum_metrics()["max"]}
+    return {"longest_run": profile.metrics()["max"], "both": profile.sum_metrics()["max"]}
 
 
 def with_bounds(baseline: Baseline) -> Baseline:
@@ -154,27 +154,27 @@ def size_table(of: Mapping[str, Mapping[str, int]]) -> str:
 
 def profile_table(of: Mapping[str, Mapping[str, int]], deferred: Mapping[str, Mapping[str, int]]) -> str:
     """Instructions of the control interrupt by variant, alone and with the deferred interrupt of the period."""
-    names = ("median", "p99", "max", "worst_case", "computed_bound", "both")
+    names = ("median", "p99", "max", "longest_run", "computed_bound", "both")
     rows = []
     for variant, values in of.items():
         bound_of_both = values["computed_bound"] + deferred[variant]["computed_bound"]
-        rows.append((worst_case.VARIANTS[variant].label, *(values.get(name, "–") for name in names), bound_of_both))
-    return _table(("instructions", "median", "p99", "max", "known worst case", "computed bound",
-                   "both interrupts: in the known worst case", "computed bound of both"), rows)
+        rows.append((long_run.VARIANTS[variant].label, *(values.get(name, "–") for name in names), bound_of_both))
+    return _table(("instructions", "median", "p99", "max", "longest run", "computed bound",
+                   "both interrupts: in the longest run", "computed bound of both"), rows)
 
 
-def module_table(profiles: Mapping[str, IsrProfile], worst: Mapping[str, IsrProfile]) -> str:
-    """Instructions by module: mean of the experiments and known worst case."""
+def module_table(profiles: Mapping[str, IsrProfile], longest: Mapping[str, IsrProfile]) -> str:
+    """Instructions by module: mean of the experiments, and in the longest run."""
     columns: list[Mapping[str, float]] = []
     for controller, profile in profiles.items():
-        columns += [profile.mean_by_module(), worst[controller].trace.longest_by_module()]
+        columns += [profile.mean_by_module(), longest[controller].trace.longest_by_module()]
     largest = {name: max(column.get(name, 0) for column in columns) for name in set().union(*columns)}
     shown = sorted((name for name, most in largest.items() if most >= _MODULE_SHOWN), key=lambda name: -largest[name])
     rows: list[tuple[Any, ...]] = [(name, *(round(column.get(name, 0)) for column in columns)) for name in shown]
     rows.append(("others", *(round(sum(count for name, count in column.items() if name not in shown))
                                for column in columns)))
     return _table(("instructions by module", *(f"{controller}, {column}" for controller in profiles
-                                               for column in ("mean", "worst case"))), rows)
+                                               for column in ("mean", "longest run"))), rows)
 
 
 def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
@@ -184,7 +184,7 @@ def rate_table(of: Mapping[str, Mapping[str, int]]) -> str:
     for variant, values in of.items():
         instructions = values["computed_bound"]
         verdicts = fits(instructions)
-        rows.append((worst_case.VARIANTS[variant].label, f"{low * instructions:.0f} to {high * instructions:.0f}",
+        rows.append((long_run.VARIANTS[variant].label, f"{low * instructions:.0f} to {high * instructions:.0f}",
                      *(verdicts[rate] for rate in RATES_HZ)))
     return _table(("at 170 MHz", "cycles of the computed bound", *(f"{rate // 1000} kHz" for rate in RATES_HZ)), rows)
 

@@ -14,8 +14,8 @@ from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.target.bound import CONTROL, Bound, Model
 from salient.target.bound_facts import read_facts
+from salient.target.long_run import VARIANTS
 from salient.target.trace import Stack, Trace
-from salient.target.worst_case import VARIANTS
 
 HANDLERS = {"interrupt": CONTROL, "deferred": "deferred_handler"}
 """Symbols of the handlers by section of the baseline; images without a deferred interrupt have only the first."""
@@ -41,27 +41,27 @@ def bounds(build: str) -> dict[str, dict[str, int]]:
             for section, variants in found.items() if any(variants.values())}
 
 
-def run(variant: str, build: str, worst_cases: Mapping[str, int]) -> int:
-    """Prints the bounds of all variants, or one of them in detail. worst_cases: known ones of the control interrupt, by
-    variant. Returns 0; UsageError for an unknown variant."""
+def run(variant: str, build: str, longest_runs: Mapping[str, int]) -> int:
+    """Prints the bounds of all variants, or one of them in detail. longest_runs: of the control interrupt, by variant.
+    Returns 0; UsageError for an unknown variant."""
     if variant not in (*VARIANTS, _ALL):
         raise UsageError(f"--bound {variant}: must be {either(tuple(VARIANTS))}")
     for name in VARIANTS if variant == _ALL else (variant,):
         for section, handler in HANDLERS.items():
             found = bound(name, build, section)
             if found:
-                worst = worst_cases.get(name) if section == "interrupt" else None
-                print(_line(f"{VARIANTS[name].label}, {handler}", found.instructions, worst), flush=True)
+                longest = longest_runs.get(name) if section == "interrupt" else None
+                print(_line(f"{VARIANTS[name].label}, {handler}", found.instructions, longest), flush=True)
                 if variant != _ALL:
                     print(details(found))
     return 0
 
 
-def _line(label: str, instructions: int, worst: int | None) -> str:
+def _line(label: str, instructions: int, longest: int | None) -> str:
     line = f"{label}: at most {instructions} instructions"
-    if worst is None:
+    if longest is None:
         return line
-    return f"{line}, {100 * (instructions / worst - 1):.0f} % above the known worst case of {worst}"
+    return f"{line}, {100 * (instructions / longest - 1):.0f} % above the longest run of {longest}"
 
 
 def details(found: Bound) -> str:

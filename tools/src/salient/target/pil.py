@@ -19,8 +19,7 @@ from salient.target.pil_report import write_pil_report
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs the scenario, the search, the computation of the bound or the measurement of the baseline, of which the
-    command line has exactly one.
+    """Runs the scenario, computes the bound or measures the baseline, of which the command line has exactly one.
     Returns 0, or 1 when a drive ended in a fault."""
     if options.figures:
         from salient.target.baseline import measure_and_write
@@ -30,11 +29,7 @@ def run(options: argparse.Namespace) -> int:
         from salient.target import baseline, bound_report
 
         known = baseline.read()["interrupt"] if estimable(options.target) else {}
-        return bound_report.run(options.bound, options.target, {name: of["worst_case"] for name, of in known.items()})
-    if options.search:
-        from salient.target.worst_case import search_and_write
-
-        return search_and_write(options.search, options.seed)
+        return bound_report.run(options.bound, options.target, {name: of["longest_run"] for name, of in known.items()})
     return _run_scenario(options.scenario, options.out or Path("out") / f"pil_{options.scenario.stem}", options.target)
 
 
