@@ -3,7 +3,8 @@
 In every README.md and in CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and in the
 root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it would
 in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the tests
-themselves. Buses get a path in the test's folder, so that tests can run in parallel.
+themselves. Commands that select tests of this suite list them only: the suite runs them. Buses get a path in the test's
+folder, so that tests can run in parallel.
 """
 
 from __future__ import annotations
@@ -25,6 +26,16 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md",
              *sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("README.md"))]
 # The suite itself, and every experiment with its report (tests/tools/test_demo.py).
 NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b", re.MULTILINE)
+
+SELECTIONS = ((re.compile(r"(\bctest [^&|\n]*)"), r"\1 -N | grep 'Total Tests: [1-9]'"),
+              (re.compile(r"(\bbuild/venv/bin/pytest [^&|\n]*)"), r"\1 --collect-only"))
+
+
+def listed(block: str) -> str:
+    """A block whose selections of this suite are listed instead of run; an empty selection fails."""
+    for selection, replacement in SELECTIONS:
+        block = selection.sub(replacement, block)
+    return block
 
 
 def sections(path: Path) -> list[tuple[str, list[str]]]:
@@ -52,13 +63,26 @@ def test_main_readme_has_commands_and_starts_a_drive() -> None:
     assert any("tools/salient sim" in block and BUS in block for block in blocks)
 
 
+@pytest.mark.parametrize(("command", "exit_code"), [
+    ("ctest --test-dir build/host -R test_control_speed_smc --output-on-failure", 0),
+    ("ctest --test-dir build/host -R none_of_this_name", 1),
+    ("build/venv/bin/pytest -q tests/hil/test_identity.py", 0),
+    ("build/venv/bin/pytest -q tests/hil/test_identity.py -k none_of_this_name", 5),
+    ("true && ctest --preset host -R speed_smc", 0)])
+def test_a_selection_is_listed_and_must_not_be_empty(command: str, exit_code: int) -> None:
+    shell = ["bash", "-euo", "pipefail", "-c", listed(command)]
+    result = subprocess.run(shell, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    assert result.returncode == exit_code, result.stdout
+    assert "Passed" not in result.stdout and " passed" not in result.stdout
+
+
 @pytest.mark.parametrize("blocks", CASES)
 def test_commands_of_a_section_succeed(tmp_path: Path, blocks: list[str]) -> None:
     simulators: list[subprocess.Popen[str]] = []
     try:
         for block in blocks:
             assert not NOT_TO_BE_RUN.search(block), f"mark it `sh untested`:\n{block}"
-            shell = ["bash", "-euo", "pipefail", "-c", block.replace(BUS, f"{tmp_path}/salient.sock")]
+            shell = ["bash", "-euo", "pipefail", "-c", listed(block).replace(BUS, f"{tmp_path}/salient.sock")]
             if re.search(r"^tools/salient sim\b", block, re.MULTILINE):
                 simulator = subprocess.Popen(shell, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                              text=True, start_new_session=True)
