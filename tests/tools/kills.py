@@ -29,7 +29,7 @@ from salient.experiments.tasks import read_results
 
 MARK = "SALIENT_KILLS"
 ENDED_WITHIN_S = 120.0
-KINDS = ("simulator", "client", "log", "pytest", "sweep")
+KINDS = ("simulator", "client", "log", "pytest", "sweep", "demo")
 SUITE = """
 import pytest
 
@@ -73,6 +73,8 @@ def command(kind: str, folder: Path) -> list[str]:
         (folder / "test_some.py").write_text(SUITE)
         return [sys.executable, "-u", "-m", "pytest", "-v", "-n", "2", "-p", "no:cacheprovider", "--basetemp",
                 str(folder / "tmp"), str(folder / "test_some.py")]
+    if kind == "demo":
+        return [*salient, "demo", "--out", str(folder / "demo")]
     (folder / "some.toml").write_text(SCENARIO)
     return [*salient, "sweep", str(folder / "some.toml"), "--seeds", "12", "--resume", "--out", str(folder / "sweep")]
 

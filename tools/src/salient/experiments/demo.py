@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import errno
 import shlex
-import signal
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -47,6 +46,7 @@ from salient.pages import Plot
 from salient.paths import COMMAND, SCENARIOS, make_folder
 from salient.progress import Progress
 from salient.version import VERSION
+from salient.workers import process_pool
 
 Metrics = dict[str, float | None]
 
@@ -115,7 +115,7 @@ def run(options: argparse.Namespace, can: str = "local", stream: TextIO = sys.st
 
 def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can: str, build: str,
                     stream: TextIO) -> dict[str, Any]:
-    with (ProcessPoolExecutor(_WORKERS if can == "local" else 1, initializer=_leave_interrupts_to_parent) as workers,
+    with (process_pool(_WORKERS if can == "local" else 1) as workers,
           Progress(sum(map(len, scenarios.values())) + len(PLOTS) + 1, stream) as progress):
         runs = _run_all(workers, scenarios, out, can, build, progress)
         results = make_results(_by_experiment(runs, "metrics"), _by_experiment(runs, "losses"),
@@ -127,11 +127,6 @@ def _run_and_report(scenarios: Mapping[str, Sequence[Scenario]], out: Path, can:
                      _files(runs, recordings, out))
         progress.step("report.html")
     return results
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Initialiser of workers: Ctrl-C reaches the whole process group; only the parent handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def summary(results: Mapping[str, Any]) -> str:

@@ -12,7 +12,6 @@ import argparse
 import os
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from salient.experiments.scenario import FaultStep, LoadStep, Record, Scenario, 
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
 from salient.paths import ROOT
+from salient.workers import process_pool
 
 PAGE = ROOT / "firmware" / "FAULTS.md"
 BRANCHES = ROOT / "tests" / "campaign" / "branching"
@@ -237,7 +237,7 @@ def main() -> int:
     options = parser.parse_args()
     every = [(case, machine, controller) for machine in MACHINES for case in CASES for controller in CONTROLLERS]
     found: dict[tuple[str, str, str], str] = {}
-    with ProcessPoolExecutor(options.jobs) as pool:
+    with process_pool(options.jobs) as pool:
         for (case, machine, controller), cell in zip(every, pool.map(_measure, every), strict=True):
             found[case.name, machine, controller] = cell
             print(f"{len(found)}/{len(every)} {machine}, {controller}, {case.name}: {cell}", flush=True)

@@ -17,7 +17,6 @@ import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
 
 from salient.experiments.campaign import names
 from salient.experiments.campaign.machines import pool_line
@@ -25,6 +24,7 @@ from salient.experiments.campaign.runner import Result, program
 from salient.experiments.compare.random_machines import WHOLE_RANGE, random_machine
 from salient.machine.path import MachineError
 from salient.paths import BUILD
+from salient.workers import process_pool
 
 FOLDER = BUILD / "healthy_drives"
 
@@ -67,7 +67,7 @@ def main() -> int:
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.drives)
     drives, faults, virtual_s = 0, 0, 0.0
-    with ProcessPoolExecutor(options.jobs) as pool:
+    with process_pool(options.jobs) as pool:
         for done in pool.map(run_drive, numbers):
             if isinstance(done, MachineError):
                 print(f"refused: {done}")

@@ -11,16 +11,13 @@ module needs nothing of a drive.
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import hashlib
 import json
-import multiprocessing
 import os
-import signal
 import socket
 from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,13 +27,13 @@ from typing import Any, TextIO
 from urllib.parse import urlsplit
 
 from salient.errors import RunFailed, UsageError, cannot_write
+from salient.workers import process_pool
 
 RESULTS = "runs.jsonl"
 _WAITING_PER_WORKER = 4
 """Tasks handed out in advance; all of them would be kept in the memory of a scheduler."""
 _BREAKS_MAX = 3
 """Deaths of local workers one after the other, with no task finished in between, after which the tasks are to blame."""
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -135,9 +132,8 @@ def _on_this_computer(tasks: Sequence[Task], function: Callable[[Any], Any], job
                       ) -> Generator[tuple[Task, Any], None, None]:
     left = {task.key: task for task in tasks}
     breaks = 0
-    context = multiprocessing.get_context("fork")  # workers of a fork server are not children of this process
     while left:
-        workers = ProcessPoolExecutor(jobs, context, _begin_worker, (os.getpid(),))
+        workers = process_pool(jobs)
         try:
             for task, result in _executed(workers, left.values(), function, jobs):
                 del left[task.key]
@@ -150,15 +146,6 @@ def _on_this_computer(tasks: Sequence[Task], function: Callable[[Any], Any], job
                                 f"{next(iter(left))}") from None
         finally:
             workers.shutdown(wait=True, cancel_futures=True)
-
-
-def _begin_worker(parent: int) -> None:
-    """Ctrl-C reaches the whole process group, and only the parent handles it; a worker ends with its parent, even when
-    that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it has died before
-        os._exit(1)
 
 
 def _on_a_cluster(tasks: Sequence[Task], function: Callable[[Any], Any], address: str

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +20,7 @@ import numpy as np
 from salient.finite_elements import steel
 from salient.finite_elements.mesh import COIL_PLUS, IRON, Geometry
 from salient.finite_elements.solver import Machine
+from salient.workers import process_pool
 
 ANGLE_STEP_DEG = 0.5
 
@@ -92,7 +92,7 @@ def csv_text(geometry: Geometry) -> str:
     """The whole map."""
     half_pitch_deg = 180.0 / geometry.rotor_poles
     angles_deg = [ANGLE_STEP_DEG * k for k in range(round(half_pitch_deg / ANGLE_STEP_DEG) + 1)]
-    with ProcessPoolExecutor() as pool:
+    with process_pool() as pool:
         curves_Wb = list(pool.map(partial(flux_linkages_Wb, geometry), angles_deg))
     lines = [
         "# Flux linkage of one phase of an 8/6 switched-reluctance machine, computed by two-dimensional nonlinear",
