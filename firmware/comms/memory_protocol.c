@@ -70,60 +70,63 @@ static parameter_status_t memory_item(const nvm_store_t *store, const self_test_
     return PARAMETER_STATUS_DONE;
 }
 
-static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal, uint32_t sequence, unsigned part,
-                                     int32_t *value) {
-    nvm_store_fault_t fault;
-    if (!nvm_store_read_fault(store, hal, sequence, &fault)) {
-        return PARAMETER_STATUS_NO_SUCH_ENTRY;
-    }
+/* False: an entry has no such part. */
+static bool fault_part(const nvm_store_fault_t *fault, unsigned part, int32_t *value) {
     switch (part) {
     case LOG_FAULT:
-        *value = fault.fault;
+        *value = fault->fault;
         break;
     case LOG_STATE:
-        *value = fault.state;
+        *value = fault->state;
         break;
     case LOG_CHECKS:
-        *value = (int32_t)fault.checks;
+        *value = (int32_t)fault->checks;
         break;
     case LOG_START:
-        *value = (int32_t)fault.start;
+        *value = (int32_t)fault->start;
         break;
     case LOG_TIME:
-        *value = (int32_t)fault.time_us;
+        *value = (int32_t)fault->time_us;
         break;
     case LOG_TIME_WRAPS:
-        *value = fault.time_wraps;
+        *value = fault->time_wraps;
         break;
     case LOG_SPEED:
-        *value = units_quarter_rpm(units_milli_rpm(fault.speed_q22));
+        *value = units_quarter_rpm(units_milli_rpm(fault->speed_q22));
         break;
     case LOG_VOLTAGE:
-        *value = fault.dc_link_voltage_q6;
+        *value = fault->dc_link_voltage_q6;
         break;
     case LOG_CURRENT:
-        *value = largest(fault.current_q9);
+        *value = largest(fault->current_q9);
         break;
     case LOG_TORQUE:
-        *value = units_torque_q8(fault.torque_reference_q24);
+        *value = units_torque_q8(fault->torque_reference_q24);
         break;
     case LOG_ANGLE:
-        *value = fault.angle;
+        *value = fault->angle;
         break;
     case LOG_SELF_TEST:
-        *value = fault.self_test;
+        *value = fault->self_test;
         break;
     case LOG_PHASES:
-        *value = fault.phases;
+        *value = fault->phases;
         break;
     default:
         if (part < LOG_ANGLE) {
-            *value = fault.current_q9[part - LOG_CURRENT_A];
+            *value = fault->current_q9[part - LOG_CURRENT_A];
             break;
         }
-        return PARAMETER_STATUS_NO_SUCH_ENTRY;
+        return false;
     }
-    return PARAMETER_STATUS_DONE;
+    return true;
+}
+
+static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal, uint32_t sequence, unsigned part,
+                                     int32_t *value) {
+    nvm_store_fault_t fault;
+    const bool found = nvm_store_read_fault(store, hal, sequence, &fault) && fault_part(&fault, part, value);
+    return found ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NO_SUCH_ENTRY;
 }
 
 bool memory_protocol_respond(const nvm_store_t *store, const self_test_t *test, const hal_t *hal,
