@@ -75,8 +75,7 @@ def test_every_controller_runs_in_every_group_that_it_supports():
         salient = {key: {"salient"} for key in ("rates", "misalignment", "standing_error", "hold",
                                                 "torque_speed_random", "partial_torque", "copper", "copper_random",
                                                 "transition", "torque_conditions", "every_speed")}
-        expected = {"paper_conditions": {"traditional", "paper"}, "ablation": {"paper", "salient"},
-                    "compressor": {"paper", "salient"}}
+        expected = {"paper_conditions": {"traditional", "paper"}, "compressor": {"paper", "salient"}}
         assert {case.controller for case in of} == (expected | salient).get(name, set(CONTROLLERS))
 
 
@@ -771,16 +770,16 @@ def test_page_is_complete_and_self_contained(tmp_path):
 
 
 def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
-    code, output = compare("dip", "ablation", "robustness", "--quick", "--out", tmp_path)
+    code, output = compare("dip", "robustness", "--quick", "--out", tmp_path)
     assert code == 0
     assert "not judged (6 of 24 angles)" in output and "not judged (10 of 500 drives)" in output
     assert "not judged (4 of 20 loads)" in output
     assert "REACHED" not in output and "0 of 0 targets reached, " in output
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
-    assert page.count('src="data:image/png;base64,') == 3 and "not judged (6 of 24 angles)" in page
+    assert page.count('src="data:image/png;base64,') == 2 and "not judged (6 of 24 angles)" in page
     content = json.loads((tmp_path / "compare.json").read_text())
     values = {(row["group"], row["figure"], row["statistic"]): row["values"] for row in content["rows"]
-              if row["group"] != "ablation" and row["condition"] != "random machines, speeds and loads"}
+              if row["condition"] != "random machines, speeds and loads"}
     assert all(row["reached"] is None for row in content["rows"])
     # Six load steps over a stroke of 30 degrees.
     assert 5.0 <= values["dip", "step_angle_deg", "gap"]["paper"] < 5.3
@@ -826,7 +825,7 @@ def test_groups_are_listed():
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
     assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
         "every_speed", "torque_speed_random", "partial_torque", "copper_random", "transition", "torque_conditions",
-        "encoders", "misalignment", "standing_error", "hold", "ablation", "robustness", "machines"]
+        "encoders", "misalignment", "standing_error", "hold", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():

@@ -64,6 +64,7 @@ class Bug:
     old: str
     new: str
     found_by: tuple[str, ...]
+    table: Path = TABLE
 
     @property
     def label(self) -> str:
@@ -79,8 +80,8 @@ class Bug:
         path = ROOT / self.file
         text = path.read_text(encoding="utf-8") if path.is_file() else ""
         if text.count(self.old) != 1 or self.old == self.new:
-            raise UsageError(f"{TABLE.name}: {self.name}: {self.file} has the old text {text.count(self.old)} times: "
-                             "must be once, and the new text another one")
+            raise UsageError(f"{self.table.name}: {self.name}: {self.file} has the old text {text.count(self.old)} "
+                             "times: must be once, and the new text another one")
         return text.replace(self.old, self.new)
 
 
@@ -96,7 +97,7 @@ def bugs(path: Path = TABLE) -> tuple[Bug, ...]:
     try:
         for group in tomllib.loads(path.read_text(encoding="utf-8"))["group"]:
             for name, old, new, *by in group["bugs"]:
-                found.append(Bug(name, group["file"], old, new, tuple(by[0] if by else group["found_by"])))
+                found.append(Bug(name, group["file"], old, new, tuple(by[0] if by else group["found_by"]), path))
     except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError) as error:
         raise UsageError(f"{path.name}: no table of bugs: {error}") from None
     names = [bug.name for bug in found]
@@ -178,7 +179,7 @@ def build(bug: Bug, folder: Path, *targets: str) -> list[Path]:
         suffix = f"-c {ROOT / source}"
         compiling = next((shlex.split(line) for line in _commands(targets[0]) if line.endswith(suffix)), None)
         if compiling is None:
-            raise UsageError(f"{TABLE.name}: {bug.name}: {source} is no part of {targets[0]}")
+            raise UsageError(f"{bug.table.name}: {bug.name}: {source} is no part of {targets[0]}")
         made.append(folder / f"{Path(source).stem}.o")
         place = folder / Path(source).name if source == bug.file else ROOT / source
         _execute(bug, [compiling[0], f"-I{folder}", *compiling[1:compiling.index("-MD")], *_WARNINGS,
@@ -207,7 +208,7 @@ def _commands(target: str) -> list[str]:
 def _execute(bug: Bug, line: list[str]) -> None:
     done = subprocess.run(line, cwd=BUILD / "host", capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise UsageError(f"{TABLE.name}: {bug.name}: does not build: {done.stderr.strip()[-2000:]}")
+        raise UsageError(f"{bug.table.name}: {bug.name}: does not build: {done.stderr.strip()[-2000:]}")
 
 
 # --- Look -----------------------------------------------------------------------------------------------------------

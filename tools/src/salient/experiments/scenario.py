@@ -162,18 +162,15 @@ _RECORDING, _LOG, _TEXT_LOG = "recording.npy", "can.blf", "can.log"
 
 
 def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: str = "host",
-                 instructions: Path | None = None, execution: Path | None = None,
-                 instruction_ns: int | None = None) -> RunResult:
+                 **options: Any) -> RunResult:
     """Runs a scenario in lock-step and writes recording.npy, can.blf and can.log to out_dir, which is made if needed.
 
     can: "local" for a new local bus, or "socketcan:INTERFACE". Virtual time 0 is the start of the drive; the variables
-    of the rig are set first, then parameters are written, then commands follow. build, instructions, execution,
-    instruction_ns: see BenchConfig. UsageError: a parameter that the drive does not know or refuses. DriveNotReady: a
-    check keeps it from starting.
+    of the rig are set first, then parameters are written, then commands follow. build, options: see BenchConfig.
+    UsageError: a parameter that the drive does not know or refuses. DriveNotReady: a check keeps it from starting.
     """
     recording_path = out_dir / _RECORDING if scenario.record else None
-    config = replace(_bench_config(scenario, recording_path, build), instructions=instructions,
-                     execution=execution, instruction_ns=instruction_ns)
+    config = replace(_bench_config(scenario, recording_path, build), **options)
     _check_parameter_names(scenario, config)
     profile = read_load_profile(load_profile_path(scenario.load_profile)) if scenario.load_profile else ()
     out_dir.mkdir(parents=True, exist_ok=True)

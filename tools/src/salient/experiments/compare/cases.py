@@ -29,20 +29,11 @@ from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 # Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
 PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
-NETWORK = {"off": 0, "fixed": 1, "frozen": 2, "learning": 3}
 RESERVE = {"torque_reserve_Nm": 8.0}
-SWITCHES = {
-    "observer fixed": {"observer_scheduling": 0}, "observer scheduled": {"observer_scheduling": 1},
-    "sharing off": {"torque_sharing": 0}, "sharing on": {"torque_sharing": 1},
-    "angle adaptation off": {"angle_adaptation": 0}, "angle adaptation on": {"angle_adaptation": 1},
-}  # fmt: skip
-"""Optional parts of the controller salient, by condition."""
 
 RIPPLE_RPM = 150.0
 RIPPLE_FROM_S = 0.3
 LONG_S = 1.0
-LATE_S = 3.0
-"""Adaptation has converged by then: 90 strokes at 150 r/min."""
 
 MOVING_MACHINES = ("saturating", "finite_element")
 SINE_NM = 4.0
@@ -84,7 +75,6 @@ carries current and leaves a torque dip that is visible at this scale; at 89 deg
 ANGLES, ANGLES_QUICK = 24, 6
 STROKE_DEG = 30.0
 _STROKE_S = STROKE_DEG / (6.0 * RIPPLE_RPM)
-SEEDS = (1, 2, 3, 4, 5)
 
 
 def _ripple(quick: bool) -> Iterator[Case]:
@@ -212,25 +202,6 @@ def _paper_conditions(quick: bool) -> Iterator[Case]:
                            replace(scenario, controller=controller, parameters=parameters))
 
 
-def _ablation(quick: bool) -> Iterator[Case]:
-    tables = {"exact tables": 0.0, "0.2 deg off": 0.2, "0.5 deg off": 0.5}
-    changes = [("paper", f"BP-PID {mode}", {"bp_mode": number}) for mode, number in NETWORK.items()]
-    changes += [("salient", change, parameters) for change, parameters in SWITCHES.items()]
-    for table, offset_deg in list(tables.items())[-1 if quick else 0:]:
-        for controller, change, parameters in changes:
-            for seed in SEEDS[:1] if quick else SEEDS:
-                # The seed also selects the angle of the load step within a stroke.
-                step = make_scenario(controller=controller, seed=seed, duration_s=RIPPLE_FROM_S + 0.1,
-                                 speed=(SpeedStep(0.0, RIPPLE_RPM),),
-                                 load=(LoadStep(STEP_AT_S + (seed - 1) * _STROKE_S / len(SEEDS), LOAD_NM),),
-                                 record=Record(1.0, STEP_AT_S), parameters={"bp_seed": seed, **parameters},
-                                 bench={"current_noise_A": 0.02, "encoder_offset_deg": offset_deg})
-                late = replace(step, duration_s=LATE_S, record=Record(1.0, LATE_S - 0.1))
-                for extractor, scenario in (("step_and_ripple", step), ("late_ripple", late)):
-                    yield Case("ablation", f"{change}, {table}", controller, extractor, scenario, f"seed {seed}",
-                               strokes=(seed - 1) / len(SEEDS))
-
-
 def _machines(quick: bool) -> Iterator[Case]:
     for scenario in every_machine.scenarios(quick):
         yield Case("machines", Path(scenario.machine).stem, scenario.controller, "every_machine", scenario)
@@ -305,10 +276,6 @@ GROUPS: dict[str, Group] = {
     "standing_error": Group("mean speed over whole turns, 40 kHz", range_cases.standing_error,
                             (("mean_error_rpm", ""),), long=True),
     "hold": Group("load at standstill, 40 kHz", range_cases.hold, (("drift_deg", ""),), long=True),
-    "ablation": Group("parts switched off, 40 kHz, saturating, 20 mA of noise, five seeds", _ablation,
-                      (("ripple", "median"), ("ripple", "worst"), ("ripple_late", "median"),
-                       ("ripple_late", "worst"), ("speed_dip_rpm", "median"),
-                       ("speed_dip_rpm", "worst")), long=True),
     "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m; random machines, speeds and loads; 40"
                         " kHz", random_cases.robustness,
                         (("failed", "count"), ("mean_error_percent", "worst"), ("deviation_rpm", "worst"),

@@ -80,7 +80,6 @@ METRICS = {
     "ripple_reference": Metric("K_t of the reference model", "", 5, 0.0002),
     "ripple_to_allowed": Metric("K_t", "of 0.010 or 1.2 times that", 3, 0.02),
     "ripple_step": Metric("K_t from 20 ms after a load step", "", 5, 0.0002),
-    "ripple_late": Metric("K_t after 3 s", "", 5, 0.0002),
     "speed_error_percent": Metric("speed error", "%", 3, 0.01),
     "settling_time_s": Metric("settling time to 0.5 %", "s", 5, 0.0001),
     "overshoot_percent": Metric("overshoot", "%", 3, 0.005),
@@ -143,11 +142,6 @@ def ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
     values["speed_error_percent"] = metrics.speed_error_percent(recording, scenario.speed[-1].value_rpm,
                                                                 (first_s, last_s))
     return values
-
-
-def late_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """Ripple over the whole recording, which is the end of a long run."""
-    return {"ripple_late": _ripple(recording, (_recorded_from_s(scenario), scenario.duration_s))}
 
 
 def start_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -328,7 +322,6 @@ def every_machine_metrics(scenario: Scenario, recording: np.ndarray, window_s: W
 
 EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "ripple": ripple_metrics,
-    "late_ripple": late_ripple_metrics,
     "start": start_metrics,
     "load_step": load_step_metrics,
     "counts": counts_metrics,

@@ -280,35 +280,6 @@ def _visible(value: float | None, of: Metric) -> float:
 
 # --- studies --------------------------------------------------------------------------------------------------------
 
-def _ablations(content: Content) -> Figure | None:
-    """Changes along y; columns of panels by table, rows by metric; one dot per seed."""
-    runs = [run for run in content["runs"] if run["group"] == "ablation" and run["figures"]]
-    if not runs:
-        return None
-    tables = list(dict.fromkeys(run["condition"].split(", ")[1] for run in runs))
-    changes = list(dict.fromkeys(run["condition"].split(", ")[0] for run in runs))
-    names = {"ripple": "K$_t$ over 0.1 s", "ripple_late": "K$_t$ after 3 s", "speed_dip_rpm": "speed drop / (r/min)"}
-    figure, axes = _panels(len(names) * len(tables), columns=len(tables), height_in=0.6 + 0.22 * len(changes),
-                           sharey=True)
-    controllers = _controllers_of_runs(runs)
-    for number, (name, label) in enumerate(names.items()):
-        for column, table in enumerate(tables):
-            axis = axes[number * len(tables) + column]
-            for run in runs:
-                change, its_table = run["condition"].split(", ")
-                if its_table == table and name in run["figures"]:
-                    y = changes.index(change) + 0.2 * (controllers.index(run["controller"]) - 0.5)
-                    axis.plot(run["figures"][name], y, _MARKER.get(run["controller"], "o"), alpha=0.7,
-                              color=controller_colour(run["controller"]), markersize=4, markeredgewidth=0)
-            axis.set_yticks(range(len(changes)), changes)
-            axis.set_ylim(len(changes) - 0.5, -0.5)
-            _logarithmic(axis.xaxis)
-            axis.set_title(table)
-            axis.set_xlabel(label)
-    _legend(figure, _rows(content, "ablation"))
-    return figure
-
-
 def _distributions(content: Content) -> Figure | None:
     """Cumulative distribution over the drives, one panel per metric, with its limit."""
     runs = [run for run in content["runs"] if run["condition"] == "random drives" and run["figures"]]
@@ -389,7 +360,6 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
         "speed / (r/min)")),),
     "hold": (("Load at standstill", "One line per machine. Short lines: target.", _curves(
         "hold", (("drift_deg", ""),), lambda parts: ("", parts[0], abs(_number(parts[1]))), "load / (N m)")),),
-    "ablation": (("Parts switched off", "One dot per seed of weights, noise and time of the load step.", _ablations),),
     "robustness": (("Random drives", "Share of the drives below a value; dashed: the limit.", _distributions),),
 }  # fmt: skip
 
