@@ -131,7 +131,7 @@ def run(variants: Sequence[Variant], count: int, out: Path) -> dict[Variant, Res
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         programs = _programs(open_ones, Path(folder))
         listed = [tasks.Task(keys[variant][number], (str(programs.get(variant, "")), cases[variant][number]))
-                  for number in range(count) for variant in variants]
+                  for number in reversed(range(count)) for variant in variants]
         with Progress(steps_of(len(listed), sys.stderr), sys.stderr, len(listed)) as progress:
             results = {}
             for task, result in tasks.run(listed, _run, out):
@@ -153,11 +153,12 @@ def rows(chosen: Sequence[Bug], count: int, out: Path, program: Path | None = No
          ) -> list[tuple[Row, tuple[str, ...]]]:
     """Rows of mechanisms, or of another program; each with the parts of the set that its cells are about."""
     seeds = [Variant(seed) for seed in SEEDS]
-    others = [Variant(bug=bug) for bug in chosen] if program is None else [Variant(program=program.resolve())]
+    others = [Variant(bug=each) for each in chosen] if program is None else [Variant(program=program.resolve())]
     results = run([*seeds, *others], count, out)
     whole = Ablation([make_case(number, SEEDS[0]) for number in range(count)], [results[seed] for seed in seeds])
-    return [(whole.row(other.bug.name if other.bug else str(other.program), parts, results[other]), parts)
-            for other in others for parts in [other.bug.found_by if other.bug else ("all",)]]
+    named = [(other.bug.name, other.bug.found_by) if other.bug else (str(other.program), ("all",))
+             for other in others]
+    return [(whole.row(name, parts, results[other]), parts) for other, (name, parts) in zip(others, named, strict=True)]
 
 
 def main() -> int:
@@ -171,11 +172,11 @@ def main() -> int:
                         help="a salient_host of other sources instead of the mechanisms, against the present build")
     parser.add_argument("--runs", type=int, default=COUNT, metavar="N", help=f"number of runs (default {COUNT})")
     options: Any = parser.parse_args()
-    chosen = [bug for bug in mechanisms() if any(part in bug.name for part in options.only)]
+    chosen = [each for each in mechanisms() if any(part in each.name for part in options.only)]
     if not chosen:
         raise UsageError(f"--only {' '.join(options.only)}: no mechanism of {TABLE.name} has this in its name")
-    for bug in chosen:
-        bug.text()
+    for mechanism in chosen:
+        mechanism.text()
     build_unchanged(["hil.py"])
     found = rows(chosen, options.runs, options.out, options.program)
     text = head() + "".join(line(row, parts, needs().get(row.name, "")) for row, parts in found)

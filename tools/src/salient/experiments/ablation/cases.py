@@ -24,7 +24,9 @@ from salient.machine.lowest_speed import lowest_speed_rpm
 from salient.machine.path import stated_conditions
 from salient.machine.scaling import scaling_of
 
-COUNT = 120
+USUAL, COUNT = 60, 84
+"""Runs of usual conditions, and of all."""
+EDGES = ("slow strokes", "lowest speed", "far")
 CONDITIONS_SEED = 45
 SPEED_PARTS = (0.01, 0.02, 0.1, 0.5, 1.0)
 SPEED_WEIGHTS = (0.2, 0.15, 0.3, 0.25, 0.1)
@@ -106,33 +108,80 @@ def _imperfections(draw: np.random.Generator, poles: int) -> tuple[dict[str, flo
     return bench, parts
 
 
+@dataclass(frozen=True)
+class _Drawn:
+    """What is varied on purpose."""
+
+    rpm: float
+    bits: int
+    kind: str
+    bench: dict[str, float]
+    parts: list[str]
+    torque_Nm: float
+    swing_Nm: float
+    frequency_Hz: float
+    settle_s: float
+
+
+def _drawn(draw: np.random.Generator, path: Path) -> _Drawn:
+    data = _data(path)
+    part = float(draw.choice(SPEED_PARTS, p=SPEED_WEIGHTS))
+    bits = int(draw.choice(BITS))
+    rpm = max(part * data.speed_base_rpm, 1.1 * lowest_speed_rpm(str(path), bits, "salient"))
+    kind = _load_kind(draw, part)
+    bench, parts = _imperfections(draw, _machine(path).rotor_poles)
+    torque_Nm = data.torque_rated_Nm * draw.uniform(0.3, 0.6) * (0.6 if part == 1.0 else 1.0)
+    swing_Nm = min(torque_Nm * draw.uniform(0.3, 0.5), PROFILE_MAX_NM)
+    frequency_Hz = round(math.exp(draw.uniform(math.log(5.0), math.log(20.0))), 2)
+    is_long = draw.uniform() < (0.4 if "misaligned" in parts and kind != "step" else 0.12)
+    settle_s = LONG_S if is_long else 0.5 if "misaligned" in parts else 0.3
+    return _Drawn(rpm, bits, kind, bench, parts, torque_Nm, swing_Nm, frequency_Hz, settle_s)
+
+
+def _at_an_edge(draw: np.random.Generator, path: Path, edge: str) -> _Drawn:
+    """Conditions that few drives have and some mechanisms were made for: a load that moves several times within a slow
+    stroke, the lowest speed of a coarse encoder, a machine far from its file."""
+    machine, data = _machine(path), _data(path)
+    torque_Nm = 0.4 * data.torque_rated_Nm
+    bench: dict[str, float] = {}
+    parts = [edge]
+    if edge == "lowest speed":
+        bits = int(draw.choice(BITS[:3]))
+        rpm = 1.05 * lowest_speed_rpm(str(path), bits, "salient")
+        return _Drawn(rpm, bits, "step", bench, parts, torque_Nm, 0.0, 10.0, 1.0)
+    offset_deg = (0.3 if edge == "slow strokes" else draw.uniform(1.0, 3.0)) * 4.0 / machine.rotor_poles
+    if draw.uniform() < 0.5:
+        bench["encoder_offset_deg"] = _single(offset_deg)
+        parts.append("misaligned")
+    if edge == "slow strokes":
+        strokes_Hz = draw.uniform(2.0, 8.0)
+        rpm = 60.0 * strokes_Hz / (machine.phases * machine.rotor_poles)
+        return _Drawn(rpm, 17, "sine", bench, parts, torque_Nm, draw.uniform(0.15, 0.35) * torque_Nm,
+                      round(strokes_Hz * draw.uniform(0.8, 3.0), 2), LONG_S + 0.5)
+    bench["inertia_gain"] = float(draw.choice((0.2, 0.33, 3.0, 5.0)))
+    parts.append("inertia")
+    rpm = float(draw.choice((0.1, 0.4))) * data.speed_base_rpm
+    return _Drawn(rpm, int(draw.choice(BITS[3:])), "step", bench, parts, torque_Nm, 0.0, 10.0, 0.8)
+
+
 @cache
 def make_case(number: int, seed: int) -> Case:
     """The case of a number, with what the seed draws."""
     draw, other = np.random.default_rng([CONDITIONS_SEED, number]), np.random.default_rng([seed, number])
     path = files()[number % len(files())]
     machine, data = _machine(path), _data(path)
-    part = float(draw.choice(SPEED_PARTS, p=SPEED_WEIGHTS))
-    bits = int(draw.choice(BITS))
-    rpm = max(part * data.speed_base_rpm, 1.1 * lowest_speed_rpm(str(path), bits, "salient"))
-    kind = _load_kind(draw, part)
-    bench, parts = _imperfections(draw, machine.rotor_poles)
-    torque_Nm = data.torque_rated_Nm * draw.uniform(0.3, 0.6) * (0.6 if part == 1.0 else 1.0)
-    swing_Nm = min(torque_Nm * draw.uniform(0.3, 0.5), PROFILE_MAX_NM)
-    frequency_Hz = round(math.exp(draw.uniform(math.log(5.0), math.log(20.0))), 2)
-    is_long = draw.uniform() < (0.4 if "misaligned" in parts and kind != "step" else 0.12)
+    drawn = _drawn(draw, path) if number < USUAL else _at_an_edge(draw, path, EDGES[number % len(EDGES)])
+    rpm, kind, bench, torque_Nm, swing_Nm = drawn.rpm, drawn.kind, drawn.bench, drawn.torque_Nm, drawn.swing_Nm
+    frequency_Hz, settle_s = drawn.frequency_Hz, drawn.settle_s
 
     start_s = 1.5 * scale_of(machine).start_s_per_rpm * rpm * bench.get("inertia_gain", 1.0) + 0.1
     loaded_s = round(start_s + 0.1 * other.uniform(), 4)
     turn_s = 60.0 / rpm
     window_s = min(max(WINDOW_S, turn_s / machine.rotor_poles, 1.0 / frequency_Hz if kind == "sine" else 0.0),
                    WINDOW_MAX_S)
-    settle_s = 0.5 if "misaligned" in parts else 0.3
     if kind == "turn":
         window_s = max(window_s, min(turn_s, WINDOW_MAX_S))
         settle_s = min(max(settle_s, 12.0 * turn_s), LONG_S)
-    if is_long:
-        settle_s = LONG_S
     from_s = round(loaded_s + settle_s, 4)
 
     profile = str(draw.choice(PROFILES)) if kind == "turn" else None
@@ -158,16 +207,17 @@ def make_case(number: int, seed: int) -> Case:
         name="ablation", machine=str(path), controller="salient", seed=seed,
         duration_s=round(from_s + window_s, 4), speed=(SpeedStep(0.0, round(rpm, 3)),), load=load,
         load_profile=profile, bench=bench, record=Record(1.0, from_s),
-        initial_angle_deg=round(other.uniform(0.0, 360.0), 2), **(conditions | {"encoder_bits": bits}))
-    return Case(number, scenario, _parts(kind, bits, part, parts, is_long), data.speed_base_rpm)
+        initial_angle_deg=round(other.uniform(0.0, 360.0), 2), **(conditions | {"encoder_bits": drawn.bits}))
+    return Case(number, scenario, _parts(drawn, rpm / data.speed_base_rpm), data.speed_base_rpm)
 
 
-def _parts(kind: str, bits: int, speed_part: float, imperfect: list[str], is_long: bool) -> tuple[str, ...]:
+def _parts(drawn: _Drawn, speed_part: float) -> tuple[str, ...]:
+    kind, imperfect = drawn.kind, drawn.parts
     moving = kind in ("sine", "ramps")
-    coarse, slow = bits <= COARSE_BITS, speed_part <= SLOW_PART
+    coarse, slow = drawn.bits <= COARSE_BITS, speed_part < 1.5 * SLOW_PART
     named = {
-        "all": True, "step": kind == "step", "moving": moving, "turn": kind == "turn", "long": is_long,
-        "coarse": coarse, "fine": not coarse, "slow": slow, "fast": speed_part >= 0.5, "slow counts": coarse and slow,
+        "all": True, "step": kind == "step", "moving": moving, "turn": kind == "turn", "long": drawn.settle_s >= LONG_S,
+        "coarse": coarse, "fine": not coarse, "slow": slow, "fast": speed_part >= 0.4, "slow counts": coarse and slow,
         "moving, misaligned": moving and "misaligned" in imperfect,
         "slow counts, misaligned": coarse and slow and "misaligned" in imperfect,
         "moving, aligned": moving and "misaligned" not in imperfect,
@@ -179,5 +229,5 @@ def _parts(kind: str, bits: int, speed_part: float, imperfect: list[str], is_lon
 
 PARTS = ("all", "step", "moving", "turn", "long", "coarse", "fine", "slow", "fast", "slow counts",
          "moving, misaligned", "slow counts, misaligned", "moving, aligned", "step, misaligned", "step, aligned",
-         "misaligned", "eccentric", "tables", "inertia", "sensors")
+         "misaligned", "eccentric", "tables", "inertia", "sensors", *EDGES)
 """Parts of the set."""
