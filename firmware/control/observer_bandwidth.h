@@ -30,10 +30,9 @@
  *
  *   J w0^2 2 pi / 2^bits = 1/512 of the largest torque,
  *
- * between 100 rad/s and the steady one. Narrower still, an error of the torque's estimate
- * moved the rotor from count to count: of an error T at any frequency the angle's is at most 0.385 T / (J w0^2), at w0
- * / sqrt(2) (derived here). A rotor that turns by less than half a count in a period has no beat: each count tells the
- * speed.
+ * between 100 rad/s and the steady one. Narrower still, an error of the torque's estimate moved the rotor from count
+ * to count: of an error T at any frequency the angle's is at most 0.385 T / (J w0^2), at w0 / sqrt(2) (derived here). A
+ * rotor that turns by less than half a count in a period has no beat: each count tells the speed.
  *
  * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
  * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,

@@ -424,6 +424,16 @@ TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_background) {
+    drive.store.inhibited = true;
+    periods(100);
+    EXPECT_EQ(drive.control.reported_fault_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+    EXPECT_EQ(drive.control.state_machine.start_inhibit_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+    command(COMMAND_RUN, 0);
+    periods(10);
+    EXPECT_TRUE(hal.open);
+}
+
 TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     command(COMMAND_RUN);
@@ -1444,6 +1454,7 @@ TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn
     hal.can_status.state = HAL_CAN_BUS_OFF;
     periods(500);
     EXPECT_EQ(hal.rejoins, 1u);
+    EXPECT_FALSE(drive.comms.commands.arming.armed);
     hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
     for (int k = 0; k < 60; k++) { // a sender that simply continues
         command(COMMAND_RUN, 0);
