@@ -93,9 +93,13 @@ static int64_t clamped_offset_q40(int64_t offset_q40) {
     return fixed_clamp_64(offset_q40, -OFFSET_LIMIT_Q40, OFFSET_LIMIT_Q40);
 }
 
-/* Step of a phase towards the angle that its flux linkage shows. */
-static inline int64_t flux_step_q40(const misalignment_parameters_t *parameters, int32_t flux_error) {
-    return fixed_product(flux_error, parameters->flux_rate_q8) >> 8;
+/* Step of a phase towards the angle that its flux linkage shows, which the end of a stroke does not undo. */
+static inline int64_t flux_step_q40(const misalignment_parameters_t *parameters, misalignment_phase_t *phase,
+                                    int32_t flux_error) {
+    const int64_t step_q40 = fixed_product(flux_error, parameters->flux_rate_q8) >> 8;
+    phase->before_last_q40 += step_q40;
+    phase->before_q40 += step_q40;
+    return step_q40;
 }
 
 static inline void add_to_offset(const misalignment_parameters_t *parameters, misalignment_phase_t *phase,
@@ -203,7 +207,7 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
             lms_step_q10(misalignment, disturbances_q24, alternating_q24, sample->torque_q24, phases);
         step_q40 = fixed_accumulate(step_q40, step_q10, parameters->rate_q30);
     } else { /* a last step of the common angle is dropped: the ripple teaches no longer */
-        step_q40 = flux_step_q40(parameters, error);
+        step_q40 = flux_step_q40(parameters, phase, error);
     }
     add_to_offset(parameters, phase, step_q40);
 }
@@ -215,7 +219,7 @@ void misalignment_follow_flux(const misalignment_parameters_t *parameters, misal
     misalignment->learning = false;
     misalignment_phase_t *phase = take_phase(misalignment, tables);
     phase->slope_q24 = slope_at_q24(parameters, tables, angle, current_q9);
-    add_to_offset(parameters, phase, flux_step_q40(parameters, flux_error(phase, flux_misalignment)));
+    add_to_offset(parameters, phase, flux_step_q40(parameters, phase, flux_error(phase, flux_misalignment)));
 }
 
 /* Part of a value around the frequency of the strokes. */
@@ -254,4 +258,27 @@ void misalignment_common_step(const misalignment_parameters_t *parameters, misal
     const int32_t step_q10 =
         limited_step_q10(fixed_multiply_shift(error_q24, quarter_q24, 18) / fixed_add(power_q22, floor_q22));
     misalignment->common_sum_q40 += fixed_product(step_q10, parameters->common_rate_q30);
+}
+
+void misalignment_end_stroke(misalignment_t *misalignment, bool changed, bool grown) {
+    if (changed && grown) {
+        for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+            misalignment_phase_t *phase = &misalignment->phase[i];
+            phase->offset_q40 = phase->before_q40 = phase->before_last_q40;
+            phase->common_sum_q40 = misalignment->common_sum_q40;
+        }
+        return;
+    }
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->before_last_q40 = phase->before_q40;
+        phase->before_q40 = phase->offset_q40;
+    }
+}
+
+void misalignment_keep(misalignment_t *misalignment) {
+    for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
+        misalignment_phase_t *phase = &misalignment->phase[i];
+        phase->before_last_q40 = phase->before_q40 = phase->offset_q40;
+    }
 }

@@ -41,7 +41,9 @@
  * that under a constant load the ripple has the last word, within 0.29 degrees. What it teaches beyond that is a load
  * that seems constant: then the flux linkage takes over until the state has been steady for 1.2 s.
  *
- * A load that changes within a stroke teaches until the end of that stroke shows it (stroke_mean.h).
+ * A load that changes within a stroke teaches until the end of that stroke shows it (stroke_mean.h). What was learned
+ * from the ripple in that stroke and the one before it is then forgotten if the load's amplitude within the stroke has
+ * grown, because learning reduces that, and itself changes the mean.
  *
  * s_j is filtered by the observer's present bandwidth. Learning of the phases is suspended unless speed and load are
  * steady, the torque is above 1 N m and the voltage is not limited; a large misalignment itself disturbs every stroke,
@@ -75,11 +77,12 @@ typedef struct {
 typedef struct {
     int32_t slope_q24; /* s_j at the last update: N m per 0.02 rad, Q7.24 */
     int32_t slope_lag1_q24, slope_lag2_q24,
-        slope_mean_q24;     /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
-    int64_t last_sum_q24;   /* disturbance_sum_q24 at the last update of the phase */
-    int64_t offset_q40;     /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
-    int64_t common_sum_q40; /* of misalignment_t, at the last update of the phase */
-    int32_t offset;         /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
+        slope_mean_q24;                  /* s_j after one filter, two, and mean: N m per 0.02 rad, Q7.24 */
+    int64_t last_sum_q24;                /* disturbance_sum_q24 at the last update of the phase */
+    int64_t offset_q40;                  /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
+    int64_t common_sum_q40;              /* of misalignment_t, at the last update of the phase */
+    int64_t before_last_q40, before_q40; /* delta_j at the begin of the last stroke, and of this one */
+    int32_t offset;                      /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 
 /* Band-pass around the frequency of the strokes, N m, Q7.24. */
@@ -157,5 +160,12 @@ void misalignment_step(const misalignment_parameters_t *parameters, misalignment
  * there. */
 void misalignment_common_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                               unsigned phases, int32_t torque_q24, int32_t stroke_part_q16);
+
+/* At the end of a stroke: forgets what was learned in it and in the one before, if it was of a load that has changed.
+ * changed, grown: of stroke_mean_t. */
+void misalignment_end_stroke(misalignment_t *misalignment, bool changed, bool grown);
+
+/* At the end of a run: what has been learned is not forgotten. */
+void misalignment_keep(misalignment_t *misalignment);
 
 #endif

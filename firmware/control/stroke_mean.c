@@ -114,6 +114,10 @@ void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_
     const bool drifted = slow && (beyond_last(half_q24, *last_q24, tolerance_q24) ||
                                   deviation_q24 / 2 > amplitude_q24 + tolerance_q24 + tolerance_q24 / 4);
     *last_q24 = half_q24;
+    const bool grown = slow && amplitude_q24 > mean->amplitude_q24 + tolerance_q24 / 2;
+    mean->grown = drifted || grown || mean->last_grown;
+    mean->last_grown = grown;
+    mean->amplitude_q24 = amplitude_q24;
     if (mean->changed) {
         for (unsigned i = 0; i < HAL_PHASES_MAX; i++) {
             mean->half_q24[i] = HALF_UNKNOWN;

@@ -49,8 +49,11 @@ typedef struct {
     uint32_t stroke;                      /* number of the stroke in the electrical revolution */
     int32_t constant_q24[HAL_PHASES_MAX]; /* means that are compared with, N m, Q7.24 */
     int32_t changed_q24;                  /* mean of the stroke that showed the last change, N m, Q7.24 */
+    uint32_t amplitude_q24;               /* |h| of the last stroke, N m, Q7.24 */
     int32_t half_q24[HAL_PHASES_MAX];     /* h of the last stroke of each phase, N m, Q7.24; INT32_MIN: unknown */
     bool changed;                         /* the load, in the stroke that ended last */
+    bool grown;                           /* the amplitude, in that stroke or the one before */
+    bool last_grown;                      /* in that stroke itself */
     stroke_mean_ended_t ended;
     uint32_t remaining;         /* updates until the load is constant */
     uint32_t disturbed_strokes; /* of the present load, less the undisturbed ones since */

@@ -27,6 +27,7 @@ NOINLINE static void follow_resets(const control_parameters_t *parameters, defer
         speed_pi_reset(&deferred->speed_pi);
         deferred->torque_offset = (torque_offset_t){0};
         periodic_load_reset(&deferred->periodic_load);
+        misalignment_keep(&deferred->misalignment);
     }
     if ((changed & DEFERRED_OBSERVER_MASK) != 0) {
         deferred->bandwidth = (observer_bandwidth_statistics_t){0, 0};
@@ -231,6 +232,7 @@ static void review_stroke_or_learn_periodic_load(const control_parameters_t *par
     stroke_mean_t *strokes = &deferred->stroke_mean;
     if (stroke_mean_to_review(strokes)) {
         stroke_mean_review(&parameters->stroke_mean, strokes);
+        misalignment_end_stroke(&deferred->misalignment, strokes->changed, strokes->grown);
     } else if (!stroke_mean_ended(strokes)) {
         learn_periodic_load(parameters, deferred, input);
     }

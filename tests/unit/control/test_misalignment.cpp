@@ -290,6 +290,9 @@ TEST(Misalignment, under_a_load_that_moves_each_phase_takes_that_of_the_flux_lin
         const double load_Nm = 8.0 + 4.0 * std::sin(2.0 * PI * 30.0 * k / RATE_HZ);
         machine.step(8.0, load_Nm, false);
         unknown.step(8.0, load_Nm, false);
+        if (k % 100 == 0) {
+            misalignment_end_stroke(&machine.state, true, true);
+        }
     }
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_NEAR(machine.offset_deg(phase), off[phase], 0.02 * std::fabs(off[phase])) << phase;
@@ -340,6 +343,33 @@ TEST(Misalignment, of_a_load_step_at_3000_rpm_the_common_angle_learns_less_than_
     for (unsigned phase = 0; phase < PHASES; phase++) {
         EXPECT_NEAR(machine.offset_deg(phase), 0.0, 0.02);
     }
+}
+
+TEST(Misalignment,
+     what_was_learned_in_the_last_two_strokes_is_forgotten_when_the_load_has_changed_and_its_amplitude_grown) {
+    // Before those strokes, and after them.
+    const auto learned_deg = [](bool changed, bool grown) {
+        Machine machine(12, {0.3, 0.3, 0.3});
+        const auto stroke = [&](bool steady, bool at_end) {
+            for (int k = 0; k < int(RATE_HZ / 30.0); k++) {
+                machine.step(8.0, 8.0, steady);
+            }
+            misalignment_end_stroke(&machine.state, at_end, grown);
+        };
+        for (unsigned k = 0; k < 8; k++) {
+            stroke(true, false);
+        }
+        const double before_deg = machine.offset_deg(1);
+        stroke(true, false);
+        stroke(true, changed);
+        stroke(false, false);
+        return std::array<double, 2>{before_deg, machine.offset_deg(1)};
+    };
+    const auto forgotten = learned_deg(true, true), reduced = learned_deg(true, false), same = learned_deg(false, true);
+    EXPECT_GT(forgotten[0], 0.02);
+    EXPECT_NEAR(forgotten[1], forgotten[0], 1e-6);
+    EXPECT_GT(same[1], same[0] + 0.02);
+    EXPECT_EQ(reduced, same);
 }
 
 TEST(Misalignment, the_common_angle_is_not_learned_while_unsteady) {
