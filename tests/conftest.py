@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from salient.__main__ import main
-from salient.builder import run_commands
+from salient.builder import build_preset
 from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.paths import BUILD, ROOT
 
@@ -38,11 +38,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     with (BUILD / "launcher.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # no two commands build at once
         for preset, targets in builds_of(selected).items():
-            commands = [["cmake", "--build", "--preset", preset, *(["--target", *targets] if targets else [])]]
-            if not (BUILD / preset / "build.ninja").exists():
-                commands.insert(0, ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="])
-            log = BUILD / f"{preset}.log"
-            if not run_commands(commands, ROOT, log, partial(print, f"building {BUILD.name}/{preset}", flush=True)):
+            log = BUILD / "build.log"
+            notice = partial(print, f"building {BUILD.name}/{preset}", flush=True)
+            if not build_preset(ROOT, preset, targets, log, notice):
                 print(log.read_text(encoding="utf-8", errors="replace")[-4000:])
                 pytest.exit(f"building {preset} failed; `tools/salient test` installs the compilers that it needs", 1)
 

@@ -27,7 +27,7 @@ STAMP = VENV / "salient.stamp"
 
 sys.path.insert(0, str(TOOLS / "src"))
 
-from salient.builder import run_commands  # noqa: E402  (needs the path above)
+from salient.builder import build_preset  # noqa: E402  (needs the path above)
 from salient.cli import make_parser  # noqa: E402
 
 
@@ -214,34 +214,17 @@ def build(preset: str, targets: list[str]) -> bool:
     when it fails."""
     folder = BUILD / preset
     log = BUILD / "build.log"
-    command = ["cmake", "--build", "--preset", preset]
-    if targets:
-        command += ["--target", *targets]
-    steps = [command] if _is_configured(folder) else [
-        ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="],
-        command,
-    ]
     notices: list[str] = []
 
     def notice() -> None:
         notices.append(f"building {folder.relative_to(ROOT)}")
         print_status(notices[-1])
 
-    if not run_commands(steps, ROOT, log, notice):
+    if not build_preset(ROOT, preset, targets, log, notice):
         sys.stderr.write(_failures(log.read_text(errors="replace")))
         print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
         sys.exit(1)
     return bool(notices)
-
-
-def _is_configured(folder: Path) -> bool:
-    """True for a folder that CMake has configured without a machine file of the user, which may be gone by now."""
-    try:
-        cache = (folder / "CMakeCache.txt").read_text()
-    except OSError:
-        return False
-    without_file = re.search(r"^SALIENT_MACHINE_FILE:FILEPATH=$", cache, re.MULTILINE) is not None
-    return without_file and (folder / "build.ninja").exists()
 
 
 def _failures(text: str) -> str:

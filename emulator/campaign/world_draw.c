@@ -7,7 +7,7 @@
 #include "campaign/world_faults.h"
 #include "campaign/world_streams.h"
 
-/* Of the seeds. */
+/* Shares of the seeds. */
 #define FASTEST_SHARE 0.1        /* at the highest control rate */
 #define TORQUE_SHARE 0.15        /* in torque mode for some time */
 #define STOP_SHARE 0.1           /* stopped for some time, or off, */
@@ -31,12 +31,12 @@
 #define COLD_GAIN 0.75
 #define WARM_GAIN 1.5
 
-/* Of the client's script by its random number: below, the client is silent; below, it is silent while a hostile one is
- * not. */
+/* Limits of the random number that selects the client's script. Below each: the client is silent; it is silent while a
+ * hostile one is not; both send; it is silent while a second one is not; both send. */
 #define SILENT_PART 0.12
 #define DESERTED_PART 0.15
 #define HOSTILE_PART 0.24
-#define DESERTED_SECOND_PART 0.26 /* likewise, a second one is not */
+#define DESERTED_SECOND_PART 0.26
 #define SECOND_PART 0.32
 
 static void add_speed(world_t *world, double rpm, uint64_t begin_us) {

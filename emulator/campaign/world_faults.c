@@ -12,7 +12,7 @@
 #define FAULT_SHARE 0.065 /* of the kinds, on average, that a seed has */
 #define FAULTS_MAX 6
 
-/* Of the seeds. */
+/* Shares of the seeds. */
 #define FAULTLESS_SHARE 0.15  /* no fault of the bench */
 #define LASTING_SHARE 0.06    /* one fault alone, to the end of a long world */
 #define SLOW_SHARE 0.6        /* of them: of a kind that takes long to be noticed */

@@ -11,6 +11,26 @@ _WORK = re.compile(rb"-- |\[[0-9]+/[0-9]+\] (?!Re-checking globbed)")
 """Lines of CMake or Ninja when a folder is not up to date."""
 
 
+def build_preset(root: Path, preset: str, targets: Sequence[str], log: Path, notice: Callable[[], None]) -> bool:
+    """Brings the build of a preset of the clone in root up to date, or its targets only; configures it first where that
+    has not been done without a machine file of the user. Output, result and notice: as run_commands."""
+    folder = root / "build" / preset
+    commands = [["cmake", "--build", "--preset", preset, *(["--target", *targets] if targets else [])]]
+    if not _is_configured(folder):
+        commands.insert(0, ["cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE="])
+    return run_commands(commands, root, log, notice)
+
+
+def _is_configured(folder: Path) -> bool:
+    """True for a folder that CMake has configured without a machine file of the user, which may be gone by now."""
+    try:
+        cache = (folder / "CMakeCache.txt").read_text()
+    except OSError:
+        return False
+    without_file = re.search(r"^SALIENT_MACHINE_FILE:FILEPATH=$", cache, re.MULTILINE) is not None
+    return without_file and (folder / "build.ninja").exists()
+
+
 def run_commands(commands: Sequence[Sequence[str]], folder: Path, log: Path, notice: Callable[[], None]) -> bool:
     """Runs commands in a folder until one fails; their output goes to the log. True when all ended with 0.
 

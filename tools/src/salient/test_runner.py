@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from salient import builder
 from salient.paths import BUILD, ROOT, SCENARIOS
 
 RESULTS = BUILD / "results"
@@ -166,9 +167,12 @@ PYTHON_TESTS = {
 # --- parts of steps -------------------------------------------------------------------------------------------------
 
 def build_preset(preset: str) -> bool:
-    """Configures and builds a preset; the output is shown when it fails."""
-    return (_succeeds("cmake", "--preset", preset, "-DSALIENT_MACHINE_FILE=")
-            and _succeeds("cmake", "--build", "--preset", preset))
+    """Brings a preset up to date; the output is shown when it fails."""
+    log = BUILD / "build.log"
+    good = builder.build_preset(ROOT, preset, (), log, lambda: None)
+    if not good:
+        _print(log.read_text(encoding="utf-8", errors="replace"))
+    return good
 
 
 def _tool(name: str) -> Path:

@@ -156,18 +156,16 @@ def build_unchanged(finders: Sequence[str]) -> None:
             raise UsageError(f"{shlex.join(command[:4])} fails: {done.stdout.strip()[-2000:]}")
 
 
-def _compiled(bug: Bug, folder: Path) -> list[str]:
-    """Sources to be compiled for a bug, whose file is written into a folder: that file, or the sources that include
-    it, which find the folder's first."""
-    if bug.file.endswith(".c"):
-        (folder / Path(bug.file).name).write_text(bug.text(), encoding="utf-8")
-        return [bug.file]
-    included = bug.file.partition("/")[2]
+def _compiled(bug: Bug, folder: Path) -> list[tuple[Path, Path]]:
+    """Sources of the tree that a bug changes, each with the file to be compiled instead: that with the bug, which is
+    written into a folder, or the same source, which finds what it includes in the folder first."""
+    top, _, included = bug.file.partition("/")
     place = folder / included
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text(bug.text(), encoding="utf-8")
-    top = ROOT / bug.file.partition("/")[0]
-    return [str(path.relative_to(ROOT)) for path in sorted(top.rglob("*.c"))
+    if place.suffix == ".c":
+        return [(ROOT / bug.file, place)]
+    return [(path, path) for path in sorted((ROOT / top).rglob("*.c"))
             if f'#include "{included}"' in path.read_text(encoding="utf-8")]
 
 
@@ -175,13 +173,12 @@ def build(bug: Bug, folder: Path, *targets: str) -> list[Path]:
     """Programs with the bug in a folder: its file compiled, and they linked, as the build does it."""
     folder.mkdir(parents=True, exist_ok=True)
     made = []
-    for source in _compiled(bug, folder):
-        suffix = f"-c {ROOT / source}"
+    for source, place in _compiled(bug, folder):
+        suffix = f"-c {source}"
         compiling = next((shlex.split(line) for line in _commands(targets[0]) if line.endswith(suffix)), None)
         if compiling is None:
-            raise UsageError(f"{bug.table.name}: {bug.name}: {source} is no part of {targets[0]}")
-        made.append(folder / f"{Path(source).stem}.o")
-        place = folder / Path(source).name if source == bug.file else ROOT / source
+            raise UsageError(f"{bug.table.name}: {bug.name}: {source.relative_to(ROOT)} is no part of {targets[0]}")
+        made.append(folder / f"{source.stem}.o")
         _execute(bug, [compiling[0], f"-I{folder}", *compiling[1:compiling.index("-MD")], *_WARNINGS,
                        "-o", str(made[-1]), "-c", str(place)])
     for target in targets:
