@@ -75,10 +75,10 @@ static bool still(const moving_load_parameters_t *parameters, const moving_load_
     return moving->still >= (moving->source == MOVING_LOAD_SOURCE_UNMODELLED ? reviews : reviews * 5 / 16);
 }
 
-/* A trend soon after the release of the first stage doubles the hold. */
-static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving) {
+/* A trend soon after the release of the first of these stages doubles the hold. */
+static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving, uint32_t stages) {
     uint32_t hold_ticks = moving->hold_ticks;
-    if (moving->withheld < parameters->stages) {
+    if (moving->withheld < stages) {
         moving->first = hold_ticks == 0;
         hold_ticks *= 2;
         if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
@@ -93,7 +93,7 @@ static void withhold(const moving_load_parameters_t *parameters, moving_load_t *
     }
     moving->hold_ticks = (uint32_t)fixed_clamp((int32_t)hold_ticks, (int32_t)parameters->hold_ticks_min,
                                                (int32_t)parameters->hold_ticks_max);
-    moving->withheld = parameters->stages;
+    moving->withheld = fixed_max_u32(moving->withheld, stages);
     moving->ticks = moving->hold_ticks;
 }
 
@@ -125,19 +125,19 @@ uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, mov
     return rounding->rounding_q4;
 }
 
-uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t rounding_q4, bool from_edge, bool triggered, bool hold) {
+uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving,
+                          const observer_bandwidth_sample_t *sample, uint32_t rounding_q4, bool hold) {
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
-        fixed_accumulate(moving->trend_q36, fixed_subtract(innovation * 16, trend_q4), parameters->gain_q32);
+        fixed_accumulate(moving->trend_q36, fixed_subtract(sample->innovation * 16, trend_q4), parameters->gain_q32);
     if (moving->blocked > 0) {
         moving->blocked--;
         return 0;
     }
-    const uint32_t base_q4 = from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
+    const uint32_t base_q4 = sample->from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
     const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
-    if (triggered) {
+    if (sample->trigger != OBSERVER_TRIGGER_NONE) {
         begin_settling(parameters, moving);
     }
     moving->settling -= moving->settling > 0;
@@ -145,7 +145,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         moving->withheld = 0;
         moving->blocked = parameters->blocked_ticks;
     } else if (moving->settling == 0 && magnitude_q4 > threshold_q4) {
-        withhold(parameters, moving);
+        withhold(parameters, moving, sample->stage == OBSERVER_BANDWIDTH_BEAT_STAGE ? 1 : parameters->stages);
     } else if (moving->ticks > 0) {
         moving->ticks -= !hold;
     } else if (moving->withheld > 0) {

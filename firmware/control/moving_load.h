@@ -38,6 +38,10 @@
  * found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5
  * makes the speed drop of a load ramp of 200 ms that of the paper's controller twice over.
  *
+ * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend: of
+ * an error T the angle's is about T / (J w0^2). A trend in it withholds this stage alone; the load moves when there is
+ * a trend in the steady stage as well. The wide bandwidth would pass the beat on to the torque.
+ *
  * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is none of
  * the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
  * constants more, which remove the trend. What the step withheld before its trigger is released then, once. */
@@ -46,6 +50,8 @@
 
 #include <stdbool.h>
 #include <stdint.h>
+
+#include "control/observer_bandwidth.h"
 
 typedef struct {
     int32_t gain_q32;            /* of the low-pass per period, Q0.32 */
@@ -111,12 +117,10 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, moving_load_rounding_t *rounding,
                                  uint32_t angle_step);
 
-/* One sample: returns the number of stages to withhold. innovation: 2^-32 rev, -2^27..2^27 - 1; rounding_q4: of
- * moving_load_rounding_q4, up to half a count; from_edge: the angle was measured from the time of an edge; triggered:
- * the bandwidth has been triggered since the previous sample; hold: what is withheld stays withheld. 64-bit product,
- * rounded down. */
-uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t innovation,
-                          uint32_t rounding_q4, bool from_edge, bool triggered, bool hold);
+/* One sample: returns the number of stages to withhold. rounding_q4: of moving_load_rounding_q4, up to half a count;
+ * hold: what is withheld stays withheld. 64-bit product, rounded down. */
+uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving,
+                          const observer_bandwidth_sample_t *sample, uint32_t rounding_q4, bool hold);
 
 /* Each periods_per_review: whether the load still moves, from the estimate of the observer in N m, Q7.24; hold: what is
  * withheld stays withheld. */

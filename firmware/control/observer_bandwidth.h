@@ -52,8 +52,9 @@
 
 /* Stages of the decay, each with 13/16 of the bandwidth before, but for the last ones: the steady bandwidth, and that
  * of a beat, which is withheld without one. */
-#define OBSERVER_BANDWIDTH_STAGES 19
+#define OBSERVER_BANDWIDTH_STAGES 19u
 #define OBSERVER_BANDWIDTH_STEADY_STAGE (OBSERVER_BANDWIDTH_STAGES - 2)
+#define OBSERVER_BANDWIDTH_BEAT_STAGE (OBSERVER_BANDWIDTH_STAGES - 1)
 
 typedef struct {
     load_observer_gains_t gains;

@@ -60,9 +60,8 @@ static void limit_bandwidth(const control_parameters_t *parameters, deferred_t *
     const observer_bandwidth_sample_t *sample = &input->bandwidth;
     const uint32_t angle_step = fixed_magnitude(rotation(parameters, input));
     const uint32_t rounding_q4 = moving_load_rounding_q4(&parameters->moving_load, &deferred->rounding, angle_step);
-    const uint32_t withheld =
-        moving_load_step(&parameters->moving_load, &deferred->moving_load, sample->innovation, rounding_q4,
-                         sample->from_edge, sample->trigger != OBSERVER_TRIGGER_NONE, deferred->periodic_load.engaged);
+    const uint32_t withheld = moving_load_step(&parameters->moving_load, &deferred->moving_load, sample, rounding_q4,
+                                               deferred->periodic_load.engaged);
     observer_bandwidth_update(&parameters->bandwidth.schedule, &deferred->bandwidth, sample, angle_step, rounding_q4,
                               withheld, limits);
 }
@@ -100,7 +99,7 @@ static bool disturbed(const control_parameters_t *parameters, const deferred_inp
 
 /* Beat of the counts (observer_bandwidth.h), whose sawtooth may be as slow as the strokes. */
 static bool beats(const deferred_input_t *input) {
-    return input->bandwidth.stage == OBSERVER_BANDWIDTH_STAGES - 1;
+    return input->bandwidth.stage == OBSERVER_BANDWIDTH_BEAT_STAGE;
 }
 
 /* Speed control in which neither a disturbance, nor a beat, nor the voltage adds to the ripple. A misalignment of a

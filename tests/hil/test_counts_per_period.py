@@ -4,7 +4,8 @@ rounding to counts is then slow, and is no load. `tools/salient compare speeds e
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -22,9 +23,11 @@ WINDOWS_S = tuple((LOADED_S + after_s, LOADED_S + after_s + 0.1) for after_s in 
 def after_step(make_bench: Callable[..., Bench], tmp_path):
     """Ripple in the windows after a step to 8 N m, and the bench."""
 
-    def run(speed_rpm: float, **options) -> tuple[list[float], Bench]:
+    def run(speed_rpm: float, rig: Mapping[str, float] = MappingProxyType({}), **options) -> tuple[list[float], Bench]:
         bench = make_bench(controller="salient", record=tmp_path / "recording.npy", record_step_ns=1_000,
                            record_from_us=round(LOADED_S * 1e6), **options)
+        for name, value in rig.items():
+            setattr(bench.rig, name, value)
         bench.drive.parameters["telemetry_slow_period_ms"] = 1
         bench.drive.speed_reference_rpm = speed_rpm
         bench.at(LOADED_S).load_torque_Nm = LOAD_NM
@@ -59,6 +62,20 @@ def test_14_bits_ripple_little_near_ratios_of_counts(after_step, counts):
     ripples, bench = after_step(speed_rpm(counts, 14, 40_000), encoder_bits=14)
     assert max(ripples) < 0.25
     assert 0.003 < max(ripples[2:]) < 0.06
+    bandwidth = bench.telemetry["DRIVE_ADAPTATION.observer_bandwidth_rad_s"]
+    assert max(bandwidth.between(LOADED_S + 0.1, WINDOWS_S[-1][1]).value) <= STEADY_RAD_S
+
+
+@pytest.mark.parametrize("flux_linkage_gain", [0.91, 1.09])
+@pytest.mark.parametrize("inertia_gain", [0.65, 1.5])
+def test_14_bits_ripple_little_with_other_flux_linkages_near_a_count_per_period(after_step, flux_linkage_gain,
+                                                                               inertia_gain):
+    """The ripple of wrong tables in the narrow bandwidth of a beat is no load that moves: the wide one would pass the
+    beat on to the torque."""
+    rig = {"flux_linkage_gain": flux_linkage_gain, "inertia_gain": inertia_gain, "friction_gain": 4.3,
+           "supply_voltage_V": 277.6, "encoder_offset_deg": 0.07, "current_noise_A": 0.04}
+    ripples, bench = after_step(speed_rpm(1.024, 14, 40_000), rig, encoder_bits=14)
+    assert 0.003 < max(ripples[1:]) < 0.1
     bandwidth = bench.telemetry["DRIVE_ADAPTATION.observer_bandwidth_rad_s"]
     assert max(bandwidth.between(LOADED_S + 0.1, WINDOWS_S[-1][1]).value) <= STEADY_RAD_S
 

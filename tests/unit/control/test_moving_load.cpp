@@ -47,14 +47,19 @@ class Detector {
     explicit Detector(const moving_load_settings_t &of = settings()) : parameters(moving_load_configure(&of)) {}
 
     uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false, bool hold = false,
-                  bool triggered = false) {
+                  bool triggered = false, bool beat = false) {
         if (++periods % PERIODS_PER_REVIEW == 0) {
             const bool high = periods / (parameters.hold_ticks_min * 8 / 5) % 2 == 1; // for 40 ms
             moving_load_review(&parameters, &state, load_q24 + (high ? range_q24 : 0), hold);
         }
-        return moving_load_step(&parameters, &state, innovation,
-                                moving_load_rounding_q4(&parameters, &rounding_state, angle_step), from_edge, triggered,
-                                hold);
+        const observer_bandwidth_sample_t sample = {
+            .innovation = innovation,
+            .from_edge = from_edge,
+            .stage = beat ? OBSERVER_BANDWIDTH_BEAT_STAGE : OBSERVER_BANDWIDTH_STEADY_STAGE,
+            .trigger = triggered ? OBSERVER_TRIGGER_IN_STEADY_STATE : OBSERVER_TRIGGER_NONE,
+        };
+        return moving_load_step(&parameters, &state, &sample,
+                                moving_load_rounding_q4(&parameters, &rounding_state, angle_step), hold);
     }
     // Longest sequence of samples with withheld stages.
     uint32_t run(uint32_t samples, int32_t innovation, uint32_t angle_step = FAST) {
@@ -92,6 +97,35 @@ TEST(MovingLoad, a_constant_innovation_of_a_seventh_of_a_count_withholds_and_of_
         EXPECT_EQ(moving.step(sign * COUNT / 7), STAGES);
         EXPECT_EQ(constant.run(RATE_HZ, sign * COUNT / 9), 0u);
     }
+}
+
+TEST(MovingLoad, a_trend_in_the_stage_of_a_beat_withholds_it_and_one_5_ms_later_the_others) {
+    Detector detector;
+    uint32_t withheld = 0;
+    while (withheld == 0) {
+        withheld = detector.step(COUNT / 4, FAST, false, false, false, true);
+    }
+    EXPECT_EQ(withheld, 1u);
+    uint32_t periods = 0;
+    while (detector.step(COUNT / 4) == 1) {
+        periods++;
+    }
+    EXPECT_EQ(detector.state.withheld, STAGES);
+    EXPECT_NEAR(periods, RATE_HZ / 200, 2);
+}
+
+TEST(MovingLoad, trends_in_the_stage_of_a_beat_alone_withhold_it_for_up_to_0_8_s) {
+    Detector detector;
+    uint32_t longest = 0, held = 0;
+    for (uint32_t k = 0; k < 6 * RATE_HZ; k++) {
+        const bool beat = detector.state.withheld == 0;
+        const uint32_t withheld = detector.step(beat ? COUNT / 4 : 0, FAST, false, false, false, beat);
+        ASSERT_LE(withheld, 1u);
+        held = withheld > 0 ? held + 1 : 0;
+        longest = held > longest ? held : longest;
+    }
+    EXPECT_GT(longest, RATE_HZ * 3 / 4);
+    EXPECT_LE(longest, RATE_HZ * 33 / 40);
 }
 
 TEST(MovingLoad, rounding_to_counts_withholds_nothing_at_any_speed) {

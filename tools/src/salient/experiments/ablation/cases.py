@@ -24,9 +24,11 @@ from salient.machine.lowest_speed import lowest_speed_rpm
 from salient.machine.path import stated_conditions
 from salient.machine.scaling import scaling_of
 
-USUAL, COUNT = 60, 84
-"""Runs of usual conditions, and of all."""
+USUAL, BEATS, COUNT = 60, 84, 96
+"""Runs of usual conditions, those before the beats, and all."""
 EDGES = ("slow strokes", "lowest speed", "far")
+BEAT = "beat"
+BEAT_BITS = (13, 14, 15)
 CONDITIONS_SEED = 45
 SPEED_PARTS = (0.01, 0.02, 0.1, 0.5, 1.0)
 SPEED_WEIGHTS = (0.2, 0.15, 0.3, 0.25, 0.1)
@@ -164,13 +166,37 @@ def _at_an_edge(draw: np.random.Generator, path: Path, edge: str) -> _Drawn:
     return _Drawn(rpm, int(draw.choice(BITS[3:])), "step", bench, parts, torque_Nm, 0.0, 10.0, 0.8)
 
 
+def _in_a_beat(draw: np.random.Generator, path: Path) -> _Drawn:
+    """A step at nearly one or two counts in a control period, with tables, supply and inertia that are not the drive's:
+    as the random drives of `tools/salient compare robustness` that a change of the schedule has moved most."""
+    data = _data(path)
+    bits = int(draw.choice(BEAT_BITS))
+    counts = float(draw.choice((1.0, 2.0))) + draw.uniform(-0.03, 0.03)
+    rpm = counts * _rate_hz(path) / 2**bits * 60.0
+    while rpm > data.speed_base_rpm:
+        bits, rpm = bits + 1, rpm / 2.0
+    bench = {
+        "flux_linkage_gain": _single(draw.uniform(0.9, 1.1)),
+        "inertia_gain": _single(math.exp(draw.uniform(math.log(0.5), math.log(3.0)))),
+        "encoder_offset_deg": _single(draw.uniform(-0.1, 0.1) * 4.0 / _machine(path).rotor_poles),
+    }
+    return _Drawn(rpm, bits, "step", bench, [BEAT, "tables"], 0.4 * data.torque_rated_Nm, 0.0, 10.0,
+                  float(draw.choice((0.1, 0.2, 0.5))))
+
+
+def _conditions(draw: np.random.Generator, path: Path, number: int) -> _Drawn:
+    if number < USUAL:
+        return _drawn(draw, path)
+    return _at_an_edge(draw, path, EDGES[number % len(EDGES)]) if number < BEATS else _in_a_beat(draw, path)
+
+
 @cache
 def make_case(number: int, seed: int) -> Case:
     """The case of a number, with what the seed draws."""
     draw, other = np.random.default_rng([CONDITIONS_SEED, number]), np.random.default_rng([seed, number])
     path = files()[number % len(files())]
     machine, data = _machine(path), _data(path)
-    drawn = _drawn(draw, path) if number < USUAL else _at_an_edge(draw, path, EDGES[number % len(EDGES)])
+    drawn = _conditions(draw, path, number)
     rpm, kind, bench, torque_Nm, swing_Nm = drawn.rpm, drawn.kind, drawn.bench, drawn.torque_Nm, drawn.swing_Nm
     frequency_Hz, settle_s = drawn.frequency_Hz, drawn.settle_s
 
@@ -229,5 +255,5 @@ def _parts(drawn: _Drawn, speed_part: float) -> tuple[str, ...]:
 
 PARTS = ("all", "step", "moving", "turn", "long", "coarse", "fine", "slow", "fast", "slow counts",
          "moving, misaligned", "slow counts, misaligned", "moving, aligned", "step, misaligned", "step, aligned",
-         "misaligned", "eccentric", "tables", "inertia", "sensors", *EDGES)
+         "misaligned", "eccentric", "tables", "inertia", "sensors", *EDGES, BEAT)
 """Parts of the set."""
