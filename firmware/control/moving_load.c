@@ -1,6 +1,5 @@
 #include "control/moving_load.h"
 
-#include "control/load_observer.h"
 #include "control/machine_tables.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
@@ -12,7 +11,6 @@
 #define HOLD_MS 25
 #define HOLDS_MAX 32
 #define RELEASE_MS 5
-#define BLOCKED_MS 1000
 #define STILL_MS 500
 
 /* Ratios p / q up to this q: the trend of the next ones is below 1/14 count. */
@@ -23,17 +21,6 @@
 /* 2^-32 rev, Q28.4: 0.3 urad, what an ideal encoder leaves (observer_bandwidth.c), and 0.7 urad. */
 #define THRESHOLD_IDEAL_Q4 3281
 #define THRESHOLD_EDGE_Q4 7656
-
-/* 2 pi 100 Hz times 2^32 / 2 pi, in Q4. */
-#define SLOPE_1_S_Q36 (INT64_C(100) << 36)
-
-/* T 2 pi 100 / (J w^3). */
-static uint32_t implausible_q4(const moving_load_settings_t *settings) {
-    const int64_t acceleration = load_observer_acceleration(settings->torque_max_q24, settings->inertia_q30);
-    const int64_t bandwidth = settings->bandwidth_rad_s;
-    const int64_t trend_q4 = fixed_divide(fixed_divide(acceleration * SLOPE_1_S_Q36, bandwidth * bandwidth), bandwidth);
-    return (uint32_t)fixed_saturate(trend_q4 << machine_tables.speed_exponent);
-}
 
 /* Low-pass of the estimate, 2^6 reviews: 6 ms at 40 kHz. */
 #define LOAD_SHIFT 6
@@ -57,8 +44,6 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
         .time_constant = time_constant,
         .encoder_shift = encoder_shift,
         .threshold_count_q4 = (2u << encoder_shift) + THRESHOLD_IDEAL_Q4,
-        .implausible_q4 = implausible_q4(settings),
-        .blocked_ticks = ticks_per_ms * BLOCKED_MS,
         .hold_ticks_min = ticks_per_ms * HOLD_MS,
         .hold_ticks_max = ticks_per_ms * HOLD_MS * HOLDS_MAX,
         .release_ticks = ticks_per_ms * RELEASE_MS,
@@ -130,10 +115,6 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
         fixed_accumulate(moving->trend_q36, fixed_subtract(sample->innovation * 16, trend_q4), parameters->gain_q32);
-    if (moving->blocked > 0) {
-        moving->blocked--;
-        return 0;
-    }
     const uint32_t base_q4 = sample->from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
     const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
@@ -141,10 +122,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
         begin_settling(parameters, moving);
     }
     moving->settling -= moving->settling > 0;
-    if (moving->settling == 0 && magnitude_q4 > parameters->implausible_q4 && moving->withheld > 0) {
-        moving->withheld = 0;
-        moving->blocked = parameters->blocked_ticks;
-    } else if (moving->settling == 0 && magnitude_q4 > threshold_q4) {
+    if (moving->settling == 0 && magnitude_q4 > threshold_q4) {
         withhold(parameters, moving, sample->stage == OBSERVER_BANDWIDTH_BEAT_STAGE ? 1 : parameters->stages);
     } else if (moving->ticks > 0) {
         moving->ticks -= !hold;

@@ -11,10 +11,6 @@
  *
  *   trend += (innovation - trend) Ts / 1.6 ms
  *
- * A trend beyond that of a load of the drive's largest torque at 100 Hz is none of a load: the observer's model is so
- * wrong that the wide bandwidth itself makes the speed swing. Nothing is withheld then for a second. Within the 5 ms
- * after the bandwidth has widened the trend may still be that of the narrow one, at which a load causes a larger trend.
- *
  * The ripple of the drive itself has a trend as well, which a light rotor or a slow one shows. The wide bandwidth then
  * only adds noise, of J w0^2 count / 4 to the estimate, and ripple. The load has moved when the range of the estimate
  * since the last movement, after a low-pass of 6 ms, exceeds 1/8 of that noise and 1/64 of the largest torque together.
@@ -40,7 +36,8 @@
  *
  * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend: of
  * an error T the angle's is about T / (J w0^2). A trend in it withholds this stage alone; the load moves when there is
- * a trend in the steady stage as well. The wide bandwidth would pass the beat on to the torque.
+ * a trend in the steady stage as well. The wide bandwidth would pass the beat on to the torque. For 5 ms after the
+ * bandwidth has widened no trend counts: it may still be that of the narrow one.
  *
  * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is none of
  * the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
@@ -58,8 +55,6 @@ typedef struct {
     uint32_t time_constant;      /* of the low-pass, periods */
     unsigned encoder_shift;      /* a count is 2^encoder_shift of 2^-32 rev */
     uint32_t threshold_count_q4; /* of the trend, 2^-32 rev, Q28.4, for angles from counts */
-    uint32_t implausible_q4;     /* trend that no load causes, 2^-32 rev, Q28.4 */
-    uint32_t blocked_ticks;      /* after that, 1 s */
     uint32_t hold_ticks_min;     /* 25 ms, periods */
     uint32_t hold_ticks_max;     /* 0.8 s */
     uint32_t release_ticks;      /* 5 ms */
@@ -81,7 +76,6 @@ typedef struct {
     int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
-    uint32_t blocked;    /* periods in which nothing is withheld */
     uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
     uint32_t withheld;   /* stages */
     bool first;          /* none had been withheld lately, and nothing has triggered since */

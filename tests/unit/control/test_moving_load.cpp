@@ -354,34 +354,6 @@ TEST(MovingLoad, the_threshold_of_ripple_is_five_sixteenths_of_a_count) {
     }
 }
 
-TEST(MovingLoad, a_trend_that_no_load_causes_blocks_for_a_second) {
-    // 2 pi 100 Hz * 19.1 N m / (J w^3) = 122 urad.
-    const double limit = 2.0 * PI * 100.0 * 19.1 / (0.02 * std::pow(1700.0, 3)) / (2.0 * PI) * REV;
-    Detector below, above;
-    EXPECT_GT(below.run(RATE_HZ, int32_t(0.98 * limit)), RATE_HZ * 9 / 10);
-    uint32_t blocked = 0;
-    for (uint32_t k = 0; k < 3 * RATE_HZ; k++) {
-        blocked += above.step(int32_t(1.02 * limit)) == 0;
-    }
-    EXPECT_GT(blocked, 29 * RATE_HZ / 10);
-    EXPECT_EQ(above.run(RATE_HZ, 0), 0u);
-    EXPECT_GT(above.run(RATE_HZ / 10, COUNT), 0u) << "again after the second";
-}
-
-TEST(MovingLoad, a_trend_left_by_the_narrow_bandwidth_does_not_block) {
-    // Under a load that moves, a second at the narrow bandwidth leaves 25 counts, which the wide one removes.
-    Detector moving;
-    moving.run(RATE_HZ / 10, 25 * COUNT);
-    uint32_t narrow = 0;
-    while (moving.step(25 * COUNT) == 0) {
-        ASSERT_LT(++narrow, RATE_HZ);
-    }
-    EXPECT_GT(narrow, RATE_HZ / 2) << "blocked before";
-    for (uint32_t k = 0; k < RATE_HZ / 50; k++) {
-        ASSERT_EQ(moving.step(int32_t(25 * COUNT * std::exp(-1700.0 * k / RATE_HZ))), STAGES) << k;
-    }
-}
-
 TEST(MovingLoad, edges_have_a_threshold_of_0_7_urad) {
     const double urad = REV / (2.0 * PI) * 1e-6;
     for (const double trend_urad : {0.65, 0.75}) {

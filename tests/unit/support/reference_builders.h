@@ -62,7 +62,6 @@ inline moving_load_t model_of(const moving_load_parameters_t &p, bool edges, dou
     moving.rate_hz = rate_hz;
     // A count's rounding adds to the threshold only at low speeds.
     moving.threshold = (edges ? 7656.0 : p.threshold_count_q4) / 16.0 / fixed_point::REV;
-    moving.implausible = p.implausible_q4 / 16.0 / fixed_point::REV;
     moving.stages = p.stages;
     moving.settling_s = p.settling_ticks / rate_hz;
     return moving;

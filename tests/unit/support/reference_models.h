@@ -106,31 +106,30 @@ inline double rounding_counts(double counts_per_period, double time_constant_per
 
 // Trend of the innovation, in revolutions: stages of the bandwidth that are withheld while the load moves.
 struct moving_load_t {
-    double rate_hz, threshold, implausible;
+    double rate_hz, threshold;
     unsigned stages;
     double settling_s; // after a trigger
-    double time_constant_s = 1.6e-3, hold_min_s = 0.05, hold_max_s = 0.8, release_s = 0.005, blocked_s = 1.0;
-    double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, blocked_until_s = 0.0, settled_s = 0.0, time_s = 0.0;
+    double time_constant_s = 1.6e-3, hold_min_s = 0.05, hold_max_s = 0.8, release_s = 0.005;
+    double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, settled_s = 0.0, time_s = 0.0;
     unsigned withheld = 0;
 
-    // rounding: added to the threshold.
-    unsigned step(double innovation, double rounding, bool triggered) {
+    // rounding: added to the threshold; beat: the bandwidth is that of a beat.
+    unsigned step(double innovation, double rounding, bool triggered, bool beat = false) {
         const double magnitude = time_s < settled_s ? 0.0 : std::fabs(trend);
         time_s += 1.0 / rate_hz;
         remaining_s -= 1.0 / rate_hz;
         trend += (innovation - trend) / (time_constant_s * rate_hz);
-        if (time_s < blocked_until_s) {
-            return 0;
-        }
         if (triggered) {
             settled_s = time_s + settling_s;
         }
-        if (magnitude > implausible && withheld > 0) {
-            withheld = 0;
-            blocked_until_s = time_s + blocked_s;
-        } else if (magnitude > threshold + rounding) {
-            hold_s = std::clamp(withheld == stages ? hold_s : 2.0 * hold_s, hold_min_s, hold_max_s);
-            withheld = stages;
+        if (magnitude > threshold + rounding) {
+            const unsigned wanted = beat ? 1 : stages;
+            if (withheld < wanted) {
+                hold_s *= 2.0;
+                settled_s = time_s + release_s;
+            }
+            hold_s = std::clamp(hold_s, hold_min_s, hold_max_s);
+            withheld = std::max(withheld, wanted);
             remaining_s = hold_s;
         } else if (remaining_s <= 0.0 && withheld > 0) {
             withheld--;
