@@ -17,6 +17,8 @@ from flux_map_files import csv_text, formula, rows, write_machine
 
 from salient.bench.programs import executable
 from salient.errors import UsageError
+from salient.generate import machine as generate_machine
+from salient.generate import machine_sources
 from salient.machine import cache, image
 from salient.machine.cache import machine_image
 from salient.paths import MACHINES, ROOT
@@ -102,6 +104,30 @@ def test_image_is_made_once_and_again_when_file_or_map_change(empty_cache: Path,
     path.write_text(text, encoding="utf-8")
     flux_map.write_bytes((copied / flux_map.name).read_bytes())
     assert machine_image(str(path)) == first
+
+
+def test_c_sources_are_made_once_for_all_builds_and_again_when_the_file_changes(empty_cache, tmp_path, monkeypatch):
+    path = variation(tmp_path, "compiled")
+    runs = []
+
+    def files_of(file: Path) -> tuple[str, str, bytes]:
+        runs.append(file)
+        return original(file)
+
+    original = machine_sources.files_of
+    monkeypatch.setattr(machine_sources, "files_of", files_of)
+    names = ("machine_tables.c", "machine_plant.c", "machine.image", "machine.d")
+    for build in ("host", "cortex-m4"):
+        assert generate_machine.main([str(path), str(tmp_path / build)]) == 0
+    host, target = ([(tmp_path / build / name).read_bytes() for name in names] for build in ("host", "cortex-m4"))
+    assert host[:3] == target[:3] and machine_image(str(path)).read_bytes() == host[2]
+    assert host[3].startswith(str(tmp_path / "host").encode())
+    assert target[3].startswith(str(tmp_path / "cortex-m4").encode())
+    assert len(runs) == 1
+    path.write_text(path.read_text(encoding="utf-8").replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.03"),
+                    encoding="utf-8")
+    assert generate_machine.main([str(path), str(tmp_path / "host")]) == 0
+    assert len(runs) == 2 and (tmp_path / "host" / names[0]).read_bytes() != host[0]
 
 
 def test_image_of_a_file_that_changes_meanwhile_is_that_of_its_content(empty_cache, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ import pytest
 from salient.bus.signals import drive_database
 from salient.dbc import database_hash
 from salient.generate import resolution
-from salient.generate.machine import tables_source
+from salient.generate.machine_sources import tables_source
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.image import firmware_tables
 from salient.machine.magnetics import Formula

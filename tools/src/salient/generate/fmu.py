@@ -19,7 +19,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from salient.generate.files import write_files
-from salient.generate.machine import plant_source
+from salient.generate.machine_sources import plant_source
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.scaling import scaling_of
 

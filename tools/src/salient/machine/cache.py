@@ -1,7 +1,8 @@
-"""Machine images by the content of their machine files, in the build folder: what a drive starts with.
+"""Machine images and C sources by the content of their machine files, in the build folder: a drive starts with an
+image, a drive of one machine is compiled with the sources.
 
-An image is made once and never changed: its name is a hash of what it is made of. Any number of processes may make and
-use images at the same time. The folder may be removed while no drive is started.
+They are made once and never changed: their name is a hash of what they are made of. Any number of processes may make
+and use them at the same time. The folder may be removed while no drive is started.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from salient.machine.path import MachineError, machine_path, stated_conditions
 from salient.paths import BUILD, DRIVE_DBC, IS_WHEEL, PARAMETERS, PYTHON_PACKAGES
 
 FOLDER = BUILD / "machines"
+IMAGE_SUFFIX = ".machine"
 _BYTES_MAX = 30_000_000
 """More than machine files and maps may have."""
 
@@ -27,19 +29,30 @@ _BYTES_MAX = 30_000_000
 def machine_image(name_or_path: str) -> Path:
     """The image of a bundled machine or a machine file. UsageError: a mistake in the file, one line that names it."""
     try:
-        path = machine_path(name_or_path)
-        while True:
-            key = content_key(path)
-            cached = FOLDER / f"{key}.machine"
-            if cached.exists():
-                return cached
-            from salient.machine.image import image_of  # NumPy and pydantic: half of the time of a start
-
-            image = image_of(path)
-            if content_key(path) == key:  # else the file was changed meanwhile
-                _write(cached, image)
+        return made_once(machine_path(name_or_path), _image)[0]
     except MachineError as error:
         raise UsageError(str(error)) from None
+
+
+def made_once(path: Path, make: Callable[[Path], Mapping[str, bytes]], suffixes: Sequence[str] = (IMAGE_SUFFIX,)
+              ) -> list[Path]:
+    """Files of these suffixes, which `make` makes of a machine file: suffix -> content, and all that it makes is kept.
+    MachineError of `make`; UsageError: they cannot be kept."""
+    while True:
+        key = content_key(path)
+        kept = [FOLDER / f"{key}{suffix}" for suffix in suffixes]
+        if all(file.exists() for file in kept):
+            return kept
+        made = make(path)
+        if content_key(path) == key:  # else the file was changed meanwhile
+            for suffix, content in made.items():
+                _write(FOLDER / f"{key}{suffix}", content)
+
+
+def _image(path: Path) -> Mapping[str, bytes]:
+    from salient.machine.image import image_of  # NumPy and pydantic: half of the time of a start
+
+    return {IMAGE_SUFFIX: image_of(path)}
 
 
 def bench_config(given: Mapping[str, Any]) -> BenchConfig:
@@ -55,9 +68,17 @@ def content_key(path: Path) -> str:
     loading it reports the mistake."""
     machine = _content(path)
     digest = hashlib.sha256(_generator())
-    for content in (machine, *map(_content, _map_of(path, machine))):
+    for content in (machine, *map(_content, map_of(path))):
         digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()[:32]
+
+
+def map_of(path: Path) -> list[Path]:
+    """The flux-linkage map that a machine file names; none in a file that cannot be read."""
+    try:
+        return [path.parent / tomllib.loads(_content(path).decode("utf-8-sig"))["magnetics"]["file"]]
+    except (ValueError, RecursionError, KeyError, TypeError):
+        return []
 
 
 def _content(path: Path) -> bytes:
@@ -69,20 +90,13 @@ def _content(path: Path) -> bytes:
     return b"none"
 
 
-def _map_of(path: Path, machine: bytes) -> list[Path]:
-    """The flux-linkage map of a machine file."""
-    try:
-        return [path.parent / tomllib.loads(machine.decode("utf-8-sig"))["magnetics"]["file"]]
-    except (ValueError, RecursionError, KeyError, TypeError):
-        return []
-
-
 @lru_cache
 def _generator() -> bytes:
-    """Hash of everything that the image of a given file depends on."""
+    """Hash of everything that the image and the C sources of a given file depend on."""
     folder = Path(__file__).parent
     digest = hashlib.sha256()
-    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")), DRIVE_DBC, PARAMETERS]
+    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")),
+              folder.with_name("generate") / "machine_sources.py", DRIVE_DBC, PARAMETERS]
     if IS_WHEEL:
         from importlib.metadata import version  # takes as long as the rest of a start
 
