@@ -76,18 +76,19 @@ def test_a_unit_test_fails_with_a_bug_and_passes_without_it(tmp_path: Path) -> N
 
 def test_a_bug_that_is_missed_is_told_and_what_was_found_is_not_looked_for_again(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    looked = []
+    looked = tmp_path / "looked"
 
-    def look(bug: Bug, kind: str, out: Path, seeds_max: int) -> Finding:
-        looked.append(kind)
+    def look(bug: Bug, kind: str, out: Path, seeds_max: int) -> Finding:  # in a worker process
+        with looked.open("a", encoding="utf-8") as file:
+            file.write(f"{kind}\n")
         return {"by": "Suite.test" if kind == "unit" else "", "processor_s": 1.0}
 
     monkeypatch.setattr(planted, "look", look)
     monkeypatch.setattr(planted, "build_unchanged", lambda finders: None)
     chosen = [dataclasses.replace(OVER_SPEED, found_by=("test_monitors_encoder_monitor",)),
               dataclasses.replace(OVER_SPEED, name="over_speed: alive", found_by=("campaign",))]
-    assert planted.run(chosen[:1], planted.KINDS, tmp_path) == 0 and looked == ["unit"]
-    assert planted.run(chosen, planted.KINDS, tmp_path) == 1 and looked == ["unit", "campaign"]
+    assert planted.run(chosen[:1], planted.KINDS, tmp_path) == 0 and looked.read_text() == "unit\n"
+    assert planted.run(chosen, planted.KINDS, tmp_path) == 1 and looked.read_text() == "unit\ncampaign\n"
     told = capsys.readouterr().out
     assert "| over_speed: one direction only | Suite.test | - | - |" in told
     assert "| over_speed: alive | - | - | MISSED |" in told and "missed by campaign: over_speed: alive" in told

@@ -7,7 +7,7 @@ compiled with the bug, and the programs of the host build are linked with it. Un
 when one fails that passes without it; the campaign, when a seed from 1 on has a violation that it does not have without
 the bug. Such a seed is shrunk to the events that it needs, and replayed, with log and plots in a folder of DIR.
 
-Prints a line for each bug, then who missed one. DIR/results.json keeps what was found, so that an interrupted run goes
+Prints a line for each bug, then who missed one. DIR/runs.jsonl keeps what was found, so that an interrupted run goes
 on; DIR/summary.json has the counts, which a run of all also writes to tests/planted.json. Exit code 1 when a bug is
 missed by one of those that have to find it, or its replay differs.
 """
@@ -31,9 +31,11 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError, exit_code
+from salient.experiments import tasks
 from salient.experiments.campaign.failure import classes, save
 from salient.experiments.campaign.runner import Programs, commit, processor_s, run_world, run_worlds
-from salient.paths import BUILD, ROOT, make_folder
+from salient.paths import BUILD, ROOT
+from salient.progress import Progress, steps_of
 
 TABLE = ROOT / "tests" / "planted.toml"
 SUMMARY = ROOT / "tests" / "planted.json"
@@ -297,6 +299,11 @@ def look(bug: Bug, kind: str, out: Path, seeds_max: int) -> Finding:
     return run_tests(bug, bug.finders(kind))
 
 
+def _look(arguments: tuple[Bug, str, Path, int]) -> Finding:
+    """By a worker process."""
+    return look(*arguments)
+
+
 # --- Results --------------------------------------------------------------------------------------------------------
 
 
@@ -343,7 +350,7 @@ def summary(found: dict[str, dict[str, Finding]], seeds_max: int) -> dict[str, A
             "shrinking_s": max(each["shrinking_s"] for each in hunted),
             "events": max(len(each["events"]) for each in hunted), "replayed": sum(each["replays"] for each in hunted)}
     note["missed"] = {name: missed for name, kinds in found.items()
-                      if (missed := [kind for kind, each in kinds.items() if not each["by"]])}
+                      if (missed := [kind for kind in KINDS if kind in kinds and not kinds[kind]["by"]])}
     return note
 
 
@@ -352,23 +359,19 @@ def run(chosen: Sequence[Bug], kinds: Sequence[str], out: Path, seeds_max: int =
     for bug in chosen:
         bug.text()
         check_finders(bug)
-    make_folder(out)
-    results = out / "results.json"
-    kept: dict[str, Finding] = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
     sources = {kind: _sources(kind) for kind in kinds}
     build_unchanged(sorted({finder for bug in chosen for finder in bug.found_by if kind_of(finder) in kinds}))
-    found: dict[str, dict[str, Finding]] = {}
+    looks = [tasks.Task(_key(bug, kind, sources[kind], seeds_max), (bug, kind, out, seeds_max))
+             for bug in chosen for kind in kinds if bug.finders(kind)]
+    found: dict[str, dict[str, Finding]] = {bug.name: {} for bug in chosen}
+    with Progress(steps_of(len(looks), sys.stderr), sys.stderr, len(looks)) as progress:
+        for task, finding in tasks.run(looks, _look, out):
+            bug, kind, *_ = task.arguments
+            found[bug.name][kind] = finding
+            progress.item(f"{bug.name} by {kind}")
     print(f"| bug | {' | '.join(KINDS)} |\n| --- | --- | --- | --- |")
     for bug in chosen:
-        found[bug.name] = {}
-        for kind in kinds:
-            if bug.finders(kind):
-                key = _key(bug, kind, sources[kind], seeds_max)
-                if key not in kept:
-                    kept[key] = look(bug, kind, out, seeds_max)
-                    results.write_text(json.dumps(kept), encoding="utf-8")
-                found[bug.name][kind] = kept[key]
-        print(line(bug, found[bug.name]), flush=True)
+        print(line(bug, found[bug.name]))
     note = summary(found, seeds_max)
     text = json.dumps(note, indent=2) + "\n"
     (out / "summary.json").write_text(text, encoding="utf-8")
