@@ -32,6 +32,8 @@ PAGES = {
         "test": "tests/drive/test_kinds.py::test_timeout[linear_cosine-paper]", "phase": "call",
         "replay_in": "/home/user", "error": ">       bench.run_until(lambda: False, timeout=0.06)",
         "machine": "linear_cosine", "seed": 1, "virtual_time_s": 0.09, "plots": [PLOT], "stderr": "",
+        "last_stimulus": "0.250000 s run in speed mode, speed_reference_rpm = 0 r/min, 1.316 ms before the failure",
+        "stimuli": ["0.250000 s run in speed mode, speed_reference_rpm = 0 r/min"],
         "changes_before_the_failure": ["0.251316 s DRIVE_MOTION.speed_reference_rpm: 300 r/min -> 0 r/min"],
         "view": "salient view --replay build/failures/tests_drive_test_kinds.py_test_timeout_linear_cosine-paper_/0",
         "replay": "venv/bin/python -m pytest 'tests/drive/test_kinds.py::test_timeout[linear_cosine-paper]'",

@@ -1,16 +1,19 @@
-"""What a failed test leaves of a bench: CAN log, plots, true state of the last second, what changed, seed and replay
-command."""
+"""What a failed test leaves of a bench: what it did, CAN log, plots, true state of the last second, what changed, seed
+and replay command."""
 
 from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from salient.bench.session import Session
+from salient.bench.stimulus import STIMULI, Stimulus, last_before, stimuli_of
 from salient.bus.log import write_logs
 from salient.config import BenchConfig
 from salient.paths import COMMAND
@@ -27,27 +30,45 @@ RECORD_STEP_NS = 50_000
 """Of the recording that a bench of a test makes for this purpose, which takes a few percent of its time."""
 _RECORDING_HEADER_BYTES = 1024
 """RECORDER_HEADER_BYTES of emulator/plant/recorder.h."""
+_TIME_TO_ACT_S = 1e-6
+_LABELS_MAX = 12
+"""Acts of a plot that have a label: more are not read."""
+_LABEL_MAX = 90
+"""Characters of one."""
+_STIMULUS_COLOUR = "#009e73"
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a report says of a bench. last: the stimulus before the failure; stimuli: all of them, in order; changes:
+    what changed just before."""
+
+    last: str
+    stimuli: list[str]
+    changes: list[str]
 
 
 def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchConfig | None, error: str = "",
-         moment: tuple[float, str] | None = None) -> list[str]:
+         moment: tuple[float, str] | None = None) -> Saved:
     """Writes log (BLF and candump text), plots around the failure and around the first fault, bench.json with the
     notes, and a page of all that and of the error. config: of an emulator that the session has started. moment: virtual
-    time in s of what the plots are to show, and its name, instead of the failure, which is now. Returns what changed
-    just before."""
+    time in s of what the plots are to show, and its name, instead of the failure, which is now."""
     folder.mkdir(parents=True, exist_ok=True)
     clear(folder)
     write_logs(session.log, folder / "can.blf", folder / "can.log")
     moment_s, title = moment or (session.time_s, "failure")
-    plot_moment(session, moment_s, title, folder / "failure.png")
-    plot_moment(session, moment_s, title, folder / "last_second.png", TRUTH_S)
-    changed = changes(session, moment_s)
-    about: dict[str, Any] = {"virtual_time_s": session.time_s, "changes_before_the_failure": changed}
+    acts = stimuli_of(session)
+    plot_moment(session, moment_s, title, folder / "failure.png", acts)
+    plot_moment(session, moment_s, title, folder / "last_second.png", acts, TRUTH_S)
+    last = _last(acts, moment_s, title)
+    changed = changes(session, moment_s, acts)
+    about: dict[str, Any] = {"virtual_time_s": session.time_s, "last_stimulus": last,
+                             STIMULI: [asdict(stimulus) for stimulus in acts], "changes_before_the_failure": changed}
     fault = first_fault(session)
     if fault is not None:
         time_s, name = fault
-        plot_moment(session, time_s, f"first fault: {name}", folder / "first_fault.png")
-        about["first_fault"] = {"fault": name, "time_s": time_s, "changes": changes(session, time_s)}
+        plot_moment(session, time_s, f"first fault: {name}", folder / "first_fault.png", acts)
+        about["first_fault"] = {"fault": name, "time_s": time_s, "changes": changes(session, time_s, acts)}
     simulator = getattr(session, "simulator", None)
     if config is not None:
         about |= {"seed": config.seed, "machine": str(config.machine), "node": config.node}
@@ -55,8 +76,8 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    _write_page(folder, about | {"error": error}, title)
-    return changed
+    _write_page(folder, about | {"error": error, STIMULI: [str(stimulus) for stimulus in acts]}, title)
+    return Saved(last, [str(stimulus) for stimulus in acts], changed)
 
 
 def clear(folder: Path) -> None:
@@ -97,9 +118,9 @@ def first_fault(session: Session) -> tuple[float, str] | None:
     return float(fault.time_s[found[0]]), (fault.choices or {}).get(number, str(number))
 
 
-def changes(session: Session, time_s: float) -> list[str]:
-    """What changed around a moment, in order: signals with named values of drive and test bench, the load, and the
-    variables that were set. The torque reference in torque mode only: in speed mode the speed controller changes it all
+def changes(session: Session, time_s: float, acts: Sequence[Stimulus] = ()) -> list[str]:
+    """What changed around a moment, in order: signals with named values of drive and test bench, the load, and what
+    was done. The torque reference in torque mode only: in speed mode the speed controller changes it all
     the time."""
     from_s, to_s = time_s - BEFORE_S, time_s + AFTER_S
     found: list[tuple[float, str]] = []
@@ -118,7 +139,7 @@ def changes(session: Session, time_s: float) -> list[str]:
                     before, after = ((signal.choices or {}).get(int(value), f"{value:g}") if signal.choices
                                      else f"{value:g} {signal.unit}".rstrip() for value in signal.value[at - 1:at + 1])
                     found.append((float(signal.time_s[at]), f"{name}: {before} -> {after}"))
-    found += _settings(session, from_s, to_s)
+    found += [(stimulus.time_s, stimulus.text) for stimulus in acts if from_s <= stimulus.time_s <= to_s]
     return [f"{at_s:.6f} s {text}" for at_s, text in sorted(found)]
 
 
@@ -128,22 +149,10 @@ def _in_torque_mode(session: Session, time_s: float) -> bool:
     return at >= 0 and (mode.choices or {}).get(int(mode.value[at])) == "torque"
 
 
-def _settings(session: Session, from_s: float, to_s: float) -> list[tuple[float, str]]:
-    """Variables of the test bench that were set."""
-    message = session.rig_database.get_message_by_name("RIG_SET")
-    found = []
-    for time_ns, frame in session.log:
-        if (frame.arbitration_id == message.frame_id and frame.is_extended_id and from_s <= time_ns / 1e9 <= to_s
-                and len(frame.data) == message.length):
-            values: dict[str, Any] = dict(message.decode_simple(bytes(frame.data)))
-            name = str(values["quantity"])
-            when = f" at {values['at_us'] / 1e6:g} s" if values.get("at_us") else ""
-            found.append((time_ns / 1e9, f"RIG_SET: {name} = {values.get(name)}{when}"))
-    return found
-
-
-def plot_moment(session: Session, time_s: float, title: str, path: Path, before_s: float = BEFORE_S) -> None:
-    """Speed, torque and phase currents, true and in the telemetry, and the drive's state, around a moment."""
+def plot_moment(session: Session, time_s: float, title: str, path: Path,
+                acts: Sequence[Stimulus], before_s: float = BEFORE_S) -> None:
+    """What was done, speed, torque and phase currents, true and in the telemetry, and the drive's state, around a
+    moment."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -153,15 +162,19 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path, before_
          ("truth", "load_torque_Nm")],
         [("truth", f"current_{phase}_A") for phase in "abcd"],
     )  # fmt: skip
-    figure = Figure(figsize=(10, 9.5), layout="constrained")
+    from_s, to_s = max(0.0, time_s - before_s), time_s + AFTER_S
+    labelled = _labelled(acts, from_s, to_s)
+    top_in = 0.45 + 0.19 * max(1, len(labelled))
+    figure = Figure(figsize=(10, 9.5 + top_in), layout="constrained")
     FigureCanvasAgg(figure)
-    *rows, below = figure.subplots(len(panels) + 1, 1, sharex=True, height_ratios=(1, 1, 1, 0.6))
+    above, *rows, below = figure.subplots(len(panels) + 2, 1, sharex=True,
+                                          height_ratios=(top_in, 2.4, 2.4, 2.4, 1.4))
     for axes, panel in zip(rows, panels, strict=True):
         for (source, name), colour in zip(panel, COLOURS, strict=False):
             signal = getattr(session, source)[name]
             if name == "current_d_A" and not signal.value.any():
                 continue  # a machine of three phases
-            signal = signal.between(time_s - before_s, time_s + AFTER_S)
+            signal = signal.between(from_s, to_s)
             axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,
                       marker="." if before_s <= BEFORE_S else "", markersize=3)
             axes.set_ylabel(signal.unit)
@@ -169,12 +182,55 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path, before_
     state = session.telemetry["DRIVE_STATUS.state"]
     states = state.choices or {}
     below.set_yticks(list(states), list(states.values()))
-    state = state.between(time_s - before_s, time_s + AFTER_S)
+    state = state.between(from_s, to_s)
     below.step(state.time_s, state.value, where="post", color=COLOURS[0])
-    for axes in (*rows, below):
+    for axes in (above, *rows, below):
+        for stimulus in acts:
+            if from_s <= stimulus.time_s <= to_s:
+                axes.axvline(stimulus.time_s, color=_STIMULUS_COLOUR, linewidth=1, linestyle=":")
         axes.axvline(time_s, color="black", linewidth=1, linestyle="--")
         axes.grid(alpha=0.3)
+    below.set_xlim(from_s, to_s)
+    _label(above, labelled, from_s, to_s)
     below.set_ylabel("state")
     below.set_xlabel("virtual time, s")
     figure.suptitle(f"{title} at {time_s:.6f} s")
     figure.savefig(path, dpi=110)
+
+
+def _last(acts: Sequence[Stimulus], moment_s: float, title: str) -> str:
+    """The last act by a moment, and when it has not had any time to act the one before it."""
+    done = [stimulus for stimulus in acts if stimulus.time_s <= moment_s]
+    if not done:
+        return "none"
+    text = f"{done[-1]}, {1e3 * (moment_s - done[-1].time_s):.3f} ms before the {title}"
+    earlier = last_before(done, moment_s - _TIME_TO_ACT_S)
+    return text if earlier in (None, done[-1]) else f"{text}; before it {earlier}"
+
+
+def _labelled(acts: Sequence[Stimulus], from_s: float, to_s: float) -> list[Stimulus]:
+    """The latest acts of a plot, and with room the one before them, which the drive may still follow."""
+    shown = [stimulus for stimulus in acts if from_s <= stimulus.time_s <= to_s]
+    before = last_before(acts, from_s)
+    return [*([before] if before is not None and before not in shown else []), *shown][-_LABELS_MAX:]
+
+
+def _label(axes: Any, labelled: Sequence[Stimulus], from_s: float, to_s: float) -> None:
+    """A row for each act: a mark at its time, on the side with more room its text."""
+    axes.set_ylim(len(labelled) or 1, 0)
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    axes.set_ylabel("stimulus", rotation=0, ha="right", va="center")
+    for row, stimulus in enumerate(labelled):
+        is_before = stimulus.time_s < from_s
+        at_s = max(stimulus.time_s, from_s)
+        is_left = at_s < (from_s + to_s) / 2
+        axes.plot([at_s], [row + 0.5], marker="<" if is_before else "o", color=_STIMULUS_COLOUR, markersize=5,
+                  clip_on=False)
+        text = str(stimulus)
+        shown = text if len(text) <= _LABEL_MAX else f"{text[:_LABEL_MAX]}..."
+        axes.annotate(shown, (at_s, row + 0.5), xytext=(7 if is_left else -7, 0), textcoords="offset points",
+                      ha="left" if is_left else "right", va="center", fontsize="small", annotation_clip=False,
+                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.5})
+    if not labelled:
+        axes.annotate("none", (from_s, 0.5), xytext=(7, 0), textcoords="offset points", va="center", fontsize="small")

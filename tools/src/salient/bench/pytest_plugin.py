@@ -51,7 +51,7 @@ _OF_THE_BENCH = frozenset(("rig", "rigs", "truth", "at", "fault", "clear_fault",
 """Attributes of `bench` that a drive without its test bench has not."""
 _OF_ANY_DRIVE = frozenset(("machine", "node"))
 """Options that only describe a drive."""
-_CHANGES_SHOWN = 8
+_CHANGES_SHOWN, _STIMULI_SHOWN = 8, 40
 
 
 @dataclass
@@ -276,18 +276,25 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     if state.folder is not None:
         return lines
     state.folder = folder
-    seeds = []
+    seeds, heads = [], []
     for number, bench in enumerate(state.benches):
         of_bench = state.saved[number] = folder / str(number)
         if isinstance(bench, DriveOnBus):
             bench.release()
-        changed = failure.save(bench, of_bench, notes, getattr(bench, "options", None), report.longreprtext)
+        saved = failure.save(bench, of_bench, notes, getattr(bench, "options", None), report.longreprtext)
         if report.when == "teardown" and number in state.recordings:  # complete since the fixture has ended
             failure.save_truth(state.recordings[number], of_bench)
         if isinstance(bench, Bench):
             seeds.append(str(bench.options.seed))
-        lines.append(f"log, plot, seed {seeds[-1] if seeds else 'none'}: {of_bench}; at {bench.time_s:.6f} s, before:")
-        lines += [f"    {change}" for change in changed[-_CHANGES_SHOWN:]] or ["    nothing changed"]
+        of = f" of bench {number}" if len(state.benches) > 1 else ""
+        heads.append(f"last stimulus{of}: {saved.last}")
+        lines.append(f"log, plot, seed {seeds[-1] if seeds else 'none'}: {of_bench}; at {bench.time_s:.6f} s")
+        lines.append(f"everything that was done{of}:")
+        if len(saved.stimuli) > _STIMULI_SHOWN:
+            lines.append(f"    {len(saved.stimuli) - _STIMULI_SHOWN} earlier ones: {of_bench / 'failure.html'}")
+        lines += [f"    {stimulus}" for stimulus in saved.stimuli[-_STIMULI_SHOWN:]] or ["    nothing"]
+        lines.append(f"what changed in the last {failure.BEFORE_S:g} s:")
+        lines += [f"    {change}" for change in saved.changes[-_CHANGES_SHOWN:]] or ["    nothing"]
         link = link_of(bench) if isinstance(bench, Bench) else None
         if link is not None:
             lines.append(f"in a browser ({COMMAND} tab): {link}")
@@ -295,7 +302,7 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     properties = [("salient_folder", str(folder)), ("salient_seed", " ".join(seeds)), ("salient_replay", command)]
     item.user_properties += properties  # for the reports that follow
     report.user_properties += properties
-    return lines
+    return heads + lines
 
 
 def _replay(item: pytest.Item) -> str:

@@ -74,7 +74,7 @@ class Session(KnownAttributes):
     machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
     drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
 
-    node: the node number of the drive; drives: their number, with ascending node numbers from there. drive, rig,
+    node: the node number of the drive; drives: their number, with ascending node numbers from there: nodes. drive, rig,
     telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
@@ -82,6 +82,8 @@ class Session(KnownAttributes):
     """
 
     address: str
+    machine: str | None
+    nodes: range
     time_ns: int
     log: list[tuple[int, can.Message]]
     sent: list[tuple[int, can.Message]]
@@ -99,6 +101,8 @@ class Session(KnownAttributes):
                  is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
                  node: int = 0, drives: int = 1, silence_max_s: float = math.inf) -> None:
         self.address = address
+        self.machine = machine
+        self.nodes = range(node, node + drives)
         self.time_ns = 0
         self.log = []
         self.sent = []
