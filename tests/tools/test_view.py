@@ -24,9 +24,11 @@ from websockets.sync.client import connect
 
 from salient.bench import failure
 from salient.bench.drive import DriveError
+from salient.bus.log import write_logs
 from salient.bus.signals import drive_database, rig_database
 from salient.paths import BUILD, ROOT
 from salient.view import link as view_link
+from salient.view.command import LogFeed
 from salient.view.commands import COMMANDS
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
@@ -455,7 +457,13 @@ def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, m
     visitor.wait(f"salient.store.frames >= {len(bench.log)}")
     page = visitor.page
     assert page.inner_text("#machine-name") == "linear_trapezoid"
-    assert page.locator("#take").is_hidden() and page.locator("[role=tab]").all_inner_texts() == ["Signals", "Cursors"]
+    assert page.locator("#take").is_hidden() and page.locator("[role=tab]").all_inner_texts() == ["Stimulus", "Signals",
+                                                                                                   "Cursors"]
+    assert page.locator("#stimuli tbody tr").all_inner_texts() == [
+        "1\t0.000000 s\trun in speed mode, speed_reference_rpm = 600 r/min",
+        "2\t0.300000 s\tload_torque_Nm = 6 N m (scheduled at 0.000000 s)"]
+    page.click("#stimuli tbody tr:nth-child(2) button")
+    visitor.wait("salient.timeline.start_ns < 3e8 && salient.timeline.end_ns > 3e8")
     page.focus("#scrub")
     page.keyboard.press("Home")
     visitor.wait("salient.timeline.end_ns === salient.first_ns()")
@@ -472,6 +480,18 @@ def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, m
     page.screenshot(path=_picture("replay"))
     page.close()
     assert visitor.errors == []
+
+
+def test_a_log_alone_has_what_was_done(bench, tmp_path):
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.05)
+    bench.fault("winding_open", phase="b")
+    bench.run_for(0.02)
+    write_logs(bench.log, tmp_path / "can.blf")
+    found = LogFeed(tmp_path / "can.blf", str(bench.options.machine), 0).info["stimuli"]
+    assert [act["text"] for act in found] == ["run in speed mode, speed_reference_rpm = 300 r/min",
+                                              "fault winding_open begins, phase b"]
+    assert [act["time_s"] for act in found] == pytest.approx([0.0, 0.05], abs=1e-3)
 
 
 def test_every_tab_is_readable_on_a_phone(live):

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import signal
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import can
+
+from salient.bench.stimulus import STIMULI, Stimulus, act_frames, stimuli
 from salient.bus.log_reader import read_log
 from salient.config import DEFAULTS
 from salient.errors import UsageError
@@ -45,11 +49,16 @@ class LogFeed:
 
     link = None
 
-    def __init__(self, path: Path, machine: str, node: int) -> None:
+    def __init__(self, path: Path, machine: str, node: int, acts: list[Stimulus] | None = None) -> None:
+        """acts: what was done; without it what the log has of that."""
         self.store = FrameStore(kept=1 << 62)
         chunk = Chunk()
         first_ns, last_ns = None, 0
+        of_hosts: list[tuple[int, can.Message]] = []
+        relevant = act_frames(machine, (node,))
         for time_ns, message in read_log(path, "--replay"):
+            if (message.arbitration_id, message.is_extended_id) in relevant:
+                of_hosts.append((time_ns, message))
             if chunk.add(time_ns, message):
                 first_ns, last_ns = time_ns if first_ns is None else first_ns, time_ns
             if len(chunk) == _CHUNK_FRAMES:
@@ -59,9 +68,12 @@ class LogFeed:
             self.store.put(chunk)
         if first_ns is None:
             raise UsageError(f"--replay {path}: the log has no data frame")
+        if acts is None:
+            acts = stimuli(of_hosts, last_ns, machine, (node,))
         self.ended = f"{path.name}: {self.store.next_number} frames"
         self.info = {**description(machine, node), "kind": "replay", "title": str(path), "commands": [],
-                     "build": f"salient {VERSION}", "period_ms": 0, "start_ns": first_ns, "end_ns": last_ns}
+                     "build": f"salient {VERSION}", "period_ms": 0, "start_ns": first_ns, "end_ns": last_ns,
+                     "stimuli": [asdict(stimulus) for stimulus in acts]}
 
     def first_number(self) -> int:
         return 0
@@ -75,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         path, notes = _log_of(options.replay)
         feed = LogFeed(path, options.machine or notes.get("machine", DEFAULTS["machine"]),
-                       notes.get("node", 0) if options.node is None else options.node)
+                       notes.get("node", 0) if options.node is None else options.node, _acts_of(notes))
     server = Server(feed)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     print(f"live page: {server.link}", flush=True)
@@ -85,6 +97,14 @@ def run(options: argparse.Namespace) -> int:
         if feed.link is not None:
             feed.link.close()
     return 0
+
+
+def _acts_of(notes: dict[str, Any]) -> list[Stimulus] | None:
+    """Those that the report of a failure has; None in notes without them."""
+    try:
+        return [Stimulus(float(act["time_s"]), str(act["text"])) for act in notes[STIMULI]]
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def _log_of(path: Path) -> tuple[Path, dict[str, Any]]:

@@ -1,7 +1,7 @@
 // The live page: joins a source of frames with plots, pictures and controls.
 
 import { Charts, csvOf } from "./charts.js";
-import { element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeTabs, showCursors }
+import { element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
     from "./controls.js";
 import { drawLoops, drawMachine, MachineState } from "./machine.js";
 import { PHASE_COLOURS, PHASE_NAMES } from "./palette.js";
@@ -51,7 +51,11 @@ class Page {
         element("title").textContent = info.title.split("/").pop();
         element("title").title = info.title;
         document.title = `Salient: ${info.title}`;
-        makeTabs(info.commands);
+        const acts = info.stimuli ?? [];
+        makeTabs(acts.length ? [...info.commands, "stimuli"] : info.commands);
+        makeStimuli(acts, (time_ns) => this.zoom(time_ns - 0.2 * this.timeline.window_ns,
+                                                 time_ns + 0.8 * this.timeline.window_ns));
+        this.charts.stimuli_s = acts.map((act) => act.time_s);
         const act = (name, args) => this.act(name, args);
         makeRun(act, info.machine);
         makeFaults(act, info.faults, info.machine.phases);

@@ -7,6 +7,7 @@ const HEIGHT_MIN = 110;
 const HEIGHT_STACKED = 160; // where the page is one column
 const ONE_COLUMN = matchMedia("(max-width: 900px)"); // as in style.css
 const AXIS_WIDTH = 58;
+const STIMULUS_COLOUR = "#007a58";
 
 /** Minimum and maximum of each column of the plot, in two points a column; the same times for all signals. */
 export function reduced(series, grid) {
@@ -144,6 +145,7 @@ export class Charts {
         this.plots = [];
         this.list = [];
         this.marks = {};
+        this.stimuli_s = []; // times at which something was done
         this.onDraw = () => {}; // (plot, list): more to draw into a plot
         this.version = 0; // of what is drawn beside the signals
         new ResizeObserver(() => this.resize()).observe(root);
@@ -213,29 +215,44 @@ export class Charts {
         }
     }
 
-    /** Cursors and trigger as vertical lines. */
+    /** Cursors, trigger and what was done as vertical lines; acts that come at once share a line. */
     drawMarks(plot) {
         this.onDraw(plot, this.plots.find((each) => each.plot === plot)?.list ?? []);
-        const context = plot.ctx;
+        const acts = new Map();
+        this.stimuli_s.forEach((time_s, index) => {
+            acts.set(time_s, [...(acts.get(time_s) || []), index + 1]);
+        });
+        for (const [time_s, numbers] of acts) {
+            const [first, last] = [numbers[0], numbers[numbers.length - 1]];
+            drawMark(plot, time_s, first === last ? `${first}` : `${first}–${last}`, STIMULUS_COLOUR, [2, 2]);
+        }
         for (const [name, time_ns] of Object.entries(this.marks)) {
-            if (time_ns === undefined || time_ns / 1e9 < plot.scales.x.min || time_ns / 1e9 > plot.scales.x.max) {
-                continue;
+            if (time_ns !== undefined) {
+                drawMark(plot, time_ns / 1e9, name, "#444", name === "A" ? [] : name === "B" ? [6, 3] : [1, 3]);
             }
-            const x = Math.round(plot.valToPos(time_ns / 1e9, "x", true)) + 0.5;
-            context.save();
-            context.strokeStyle = context.fillStyle = "#444";
-            context.lineWidth = devicePixelRatio;
-            context.setLineDash(name === "A" ? [] : name === "B" ? [6, 3] : [1, 3]);
-            context.beginPath();
-            context.moveTo(x, plot.bbox.top);
-            context.lineTo(x, plot.bbox.top + plot.bbox.height);
-            context.stroke();
-            context.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
-            context.textAlign = "left";
-            context.fillText(name, x + 3 * devicePixelRatio, plot.bbox.top + 11 * devicePixelRatio);
-            context.restore();
         }
     }
+}
+
+/** A vertical line with a name, if its time is in the plot. */
+function drawMark(plot, time_s, name, colour, dash) {
+    if (time_s < plot.scales.x.min || time_s > plot.scales.x.max) {
+        return;
+    }
+    const x = Math.round(plot.valToPos(time_s, "x", true)) + 0.5;
+    const context = plot.ctx;
+    context.save();
+    context.strokeStyle = context.fillStyle = colour;
+    context.lineWidth = devicePixelRatio;
+    context.setLineDash(dash);
+    context.beginPath();
+    context.moveTo(x, plot.bbox.top);
+    context.lineTo(x, plot.bbox.top + plot.bbox.height);
+    context.stroke();
+    context.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    context.textAlign = "left";
+    context.fillText(name, x + 3 * devicePixelRatio, plot.bbox.top + 11 * devicePixelRatio);
+    context.restore();
 }
 
 /** The signals from one time to another as CSV: a row for each time at which one of them came, empty where another

@@ -49,6 +49,16 @@ export function makeTabs(commands) {
     select(0);
 }
 
+/** What was done in a log: {time_s, text} each; `show(time_ns)` when one is chosen. */
+export function makeStimuli(acts, show) {
+    element("stimuli").tBodies[0].append(...acts.map((act, index) => {
+        const time = make("button", { type: "button", textContent: `${act.time_s.toFixed(6)} s` });
+        time.addEventListener("click", () => show(act.time_s * 1e9));
+        return make("tr", {}, make("td", { textContent: String(index + 1) }), make("td", {}, time),
+                    make("td", {}, ...breakable(act.text)));
+    }));
+}
+
 /** Speed, torque, load, stop: `act(name, args)` carries out a command and shows its refusal. */
 export function makeRun(act, machine) {
     const onSubmit = (id, action) => element(id).addEventListener("submit", (event) => {
