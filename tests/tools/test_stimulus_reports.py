@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from salient.bench.arming import arm_frame
 from salient.bench.drive import command_frame
 from salient.bench.failure import plot_moment
 from salient.bench.stimulus import Stimulus, last_before, stimuli, stimuli_of
@@ -192,6 +193,16 @@ def test_acts_of_another_client_are_in_the_list():
     assert [(stimulus.time_s, stimulus.text.partition(" = ")[2]) for stimulus in found] == [
         (0.0, "120 r/min"), (0.04, "-60 r/min")]
     assert last_before(found, 0.039) is found[0] and last_before(found, -1.0) is None
+
+
+@pytest.mark.parametrize(("arms_ns", "is_shown"), [(-1, False), (0, False), (1_000_000, False), (500_000_000, True)])
+def test_arming_is_a_stimulus_only_without_a_request_to_run(arms_ns, is_shown):
+    run_ns = 10_000_000
+    frames = [(run_ns + step_ns, command_frame(number % 256, "run", 120.0))
+              for number, step_ns in enumerate(range(0, 600_000_000, 10_000_000))]
+    frames = sorted([*frames, (run_ns + arms_ns, arm_frame(0, "request_run"))], key=lambda timed: timed[0])
+    texts = [stimulus.text for stimulus in stimuli(frames, frames[-1][0], None, (0,))]
+    assert texts == ["run in speed mode, speed_reference_rpm = 120 r/min", *["arming: request_run"] * is_shown]
 
 
 def test_a_frame_of_unknown_content_ends_no_report():

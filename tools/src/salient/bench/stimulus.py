@@ -137,6 +137,7 @@ class _Reader:
         self._command: tuple[object, ...] | None = None
         self._command_ns = 0
         self._command_period_ns = 0
+        self._run_ns: int | None = None
         self._armings: list[Stimulus] = []
         self._challenge = 0
         self._staged: list[str] = []
@@ -203,6 +204,7 @@ class _Reader:
         unit = message.get_signal_by_name(name).unit
         if request == "run":
             self._forget_arming()
+            self._run_ns = time_ns
             self._add(time_ns, f"run in {mode} mode, {name} = {_with_unit(values[name], unit)}")
         else:
             self._add(time_ns, f"request {request}")
@@ -222,6 +224,8 @@ class _Reader:
     def _arm(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:
         del message, frame
         step = str(values["step"])
+        if step == "request_run" and self._run_ns is not None and time_ns - self._run_ns <= self._command_period_ns:
+            return  # a part of the request to run, which had priority on the bus
         if step.startswith("request"):
             self._armings.append(self._add(time_ns, f"arming: {step}"))
         elif values["response"] != response_to(self._challenge):
