@@ -35,7 +35,7 @@ def machine_files(file: Path, folder: Path) -> dict[str, str | bytes]:
     made: dict[str, str | bytes] = {name: path.read_bytes() for name, path in zip(_NAMES.values(), kept, strict=True)}
     outputs = " ".join(_escaped(folder / name) for name in made)
     # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.
-    inputs = [file.resolve(), PARAMETERS, DRIVE_DBC, *map_of(file.absolute())]
+    inputs = [file.resolve(), PARAMETERS, DRIVE_DBC, *map_of(file.absolute(), file.read_bytes())]
     return made | {"machine.d": f"{outputs}: {' '.join(map(_escaped, inputs))}\n"}
 
 

@@ -68,15 +68,15 @@ def content_key(path: Path) -> str:
     loading it reports the mistake."""
     machine = _content(path)
     digest = hashlib.sha256(_generator())
-    for content in (machine, *map(_content, map_of(path))):
+    for content in (machine, *map(_content, map_of(path, machine))):
         digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()[:32]
 
 
-def map_of(path: Path) -> list[Path]:
-    """The flux-linkage map that a machine file names; none in a file that cannot be read."""
+def map_of(path: Path, machine: bytes) -> list[Path]:
+    """The flux-linkage map that a machine file of this content names; none in one that is no machine file."""
     try:
-        return [path.parent / tomllib.loads(_content(path).decode("utf-8-sig"))["magnetics"]["file"]]
+        return [path.parent / tomllib.loads(machine.decode("utf-8-sig"))["magnetics"]["file"]]
     except (ValueError, RecursionError, KeyError, TypeError):
         return []
 

@@ -55,7 +55,7 @@ class LogFeed:
         chunk = Chunk()
         first_ns, last_ns = None, 0
         of_hosts: list[tuple[int, can.Message]] = []
-        relevant = act_frames(machine, (node,))
+        relevant = act_frames(machine, (node,)) if acts is None else {}
         for time_ns, message in read_log(path, "--replay"):
             if (message.arbitration_id, message.is_extended_id) in relevant:
                 of_hosts.append((time_ns, message))
