@@ -123,6 +123,30 @@ bool facts_may_be_deaf(const observation_t *seen) {
            facts_disturbed(seen, DISTURBS_BACKGROUND);
 }
 
+bool facts_may_be_unarmed(const observation_t *seen) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
+        if (event != NULL && event->kind == WORLD_SET &&
+            (variable_effect(event->what).disturbs & VARIABLE_LOSES_COMMANDS) != 0 &&
+            seen->client.confirmed_ns < (event->end_us > event->begin_us ? event->end_us : event->begin_us) * 1000) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_may_be_degraded(const observation_t *seen) {
+    const uint64_t now_us = seen->time_ns / 1000;
+    bool degraded = false, lost = false;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, now_us);
+        degraded = degraded || (event != NULL && event->kind == WORLD_DEGRADED);
+        lost = lost || (event != NULL && event->kind == WORLD_FAULT &&
+                        (fault_effect(event->what).disturbs & (DISTURBS_PHASE | DISTURBS_CURRENT_SENSOR)) != 0);
+    }
+    return degraded && lost && (seen->world->recovery_us == 0 || now_us < seen->world->recovery_us);
+}
+
 bool facts_frames_are_current(const observation_t *seen) {
     return !facts_bus_disturbed(seen) && !facts_checks_late(seen) && !seen->present[FAULT_CLOCK_DRIFT] &&
            seen->time_ns >= seen->reset_ns + OLD_FRAMES_NS;
@@ -226,4 +250,11 @@ double facts_added_rad_s(const observation_t *seen) {
     const double late_s =
         3e-9 * (double)seen->period_ns + OBSERVED_S + seen->largest_flux_Wb / machine->supply_voltage_V;
     return late_s * seen->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * seen->world->inertia_gain);
+}
+
+double facts_uncounted_rad_s(const observation_t *seen) {
+    const world_t *world = seen->world;
+    const double count_rad = ldexp(TWO_PI, -(int)world->encoder_bits);
+    const double inertia_kg_m2 = seen->plant->machine->inertia_kg_m2 * world->inertia_gain;
+    return sqrt(2.0 * world->machine->torque_max_Nm / inertia_kg_m2 * count_rad);
 }

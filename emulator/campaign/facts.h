@@ -58,6 +58,14 @@ bool facts_drive_disturbed(const observation_t *seen);
 /* Frames on the bus may not have reached the drive, or not in time. */
 bool facts_may_be_deaf(const observation_t *seen);
 
+/* A bus-off since the last arming may have disarmed the drive: then a request to run is off, and before that it has no
+ * effect. */
+bool facts_may_be_unarmed(const observation_t *seen);
+
+/* A drive with degraded running has had a fault of a phase and goes on with the others, also after the fault's end,
+ * until the client clears it: there are angles at which it has no torque. */
+bool facts_may_be_degraded(const observation_t *seen);
+
 /* The frames of the drive are of the present: neither disturbed nor older than a reset. */
 bool facts_frames_are_current(const observation_t *seen);
 
@@ -111,5 +119,8 @@ bool facts_sets_in_effect(const observation_t *seen);
 /* Speed that a drive of one quadrant cannot take away: what the torque limit adds in three periods, while the speed is
  * observed and while the voltage removes the largest flux linkage. */
 double facts_added_rad_s(const observation_t *seen);
+
+/* Speed that the torque limit adds within a count of the encoder from rest: w^2 = 2 T / J theta. */
+double facts_uncounted_rad_s(const observation_t *seen);
 
 #endif

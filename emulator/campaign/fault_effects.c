@@ -51,7 +51,8 @@ static const fault_effect_t fault_effects[FAULT_COUNT] = {
     [FAULT_DC_LINK_SENSOR_STUCK] = {DISTURBS_DC_LINK_SENSOR, LINK_VOLTAGE, 0},
     [FAULT_DC_LINK_SENSOR_GAIN] = {DISTURBS_DC_LINK_SENSOR, LINK_VOLTAGE, 0},
     [FAULT_DC_LINK_SENSOR_OFFSET] = {DISTURBS_DC_LINK_SENSOR, LINK_VOLTAGE, 0},
-    [FAULT_ENCODER_STUCK] = {ANGLE, ENCODER, 0},
+    /* A rotor that a frozen angle has brought to rest, and one that is held, look alike once the phases conduct on. */
+    [FAULT_ENCODER_STUCK] = {ANGLE, ENCODER | CAUSE_BIT(STALL), 0},
     /* One that stays is a wrong position of the sensor. */
     [FAULT_ENCODER_JUMP] = {ANGLE, ENCODER, 0},
     [FAULT_ENCODER_NOISE] = {ANGLE, ENCODER, 0},
@@ -61,7 +62,7 @@ static const fault_effect_t fault_effects[FAULT_COUNT] = {
     [FAULT_ENCODER_SLIP] = {ANGLE, ENCODER, 0},
     /* The speed is that of the counts, where they jump. */
     [FAULT_ENCODER_LOST_COUNTS] = {ANGLE, ENCODER | CAUSE_BIT(OVER_SPEED), 0},
-    [FAULT_ENCODER_NO_ANSWER] = {DISTURBS_ENCODER, ENCODER, 0},
+    [FAULT_ENCODER_NO_ANSWER] = {DISTURBS_ENCODER, ENCODER | CAUSE_BIT(STALL), 0}, /* its last angle stays */
     [FAULT_SHAFT_LOCKED] = {DISTURBS_SHAFT, ENCODER | OVERLOAD, 0},
     [FAULT_COULOMB_FRICTION] = {DISTURBS_SHAFT, ENCODER | OVERLOAD, 0},
     [FAULT_STATIC_FRICTION] = {DISTURBS_SHAFT, ENCODER | OVERLOAD, 0},

@@ -346,6 +346,7 @@ void observation_on_command(observation_t *seen, uint64_t time_ns, const sender_
     }
     client->succeeded = client->succeeded || meaning->other;
     client->confirmed = client->confirmed || meaning->confirms;
+    client->confirmed_ns = meaning->confirms ? time_ns : client->confirmed_ns;
     if (!meaning->command) {
         return;
     }

@@ -38,6 +38,7 @@ typedef struct {
 typedef struct {
     sender_meaning_t meant;        /* by the last motion command */
     bool confirmed;                /* an arming, since the last fault and the last run */
+    uint64_t confirmed_ns;         /* the last one */
     bool commanded;                /* to run, ever */
     bool off_seen;                 /* since the last request to run */
     bool clear_seen;               /* since the last fault */

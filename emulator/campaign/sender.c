@@ -17,6 +17,7 @@
 #define LIMITED_US 200000   /* with several sessions */
 #define SAVING_US 30000     /* in which a set is written */
 #define RECOVERY_OFF_US 25000
+#define WITHDRAWN_US 12000                  /* of them after the end of the run */
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 
 static void mix(sender_t *sender, const void *bytes, size_t count) {
@@ -59,6 +60,17 @@ static sender_request_t clearing(const sender_t *sender) {
     return since_us % 40000 < 20000 ? SENDER_OFF : SENDER_CLEAR;
 }
 
+/* After the faults a client withdraws its request until the drive has left its run: after a bus-off the first frames
+ * are out of sequence to the drive, and count for nothing. */
+static bool withdraws(sender_t *sender) {
+    const uint64_t since_us = sender->time_us - sender->world->recovery_us;
+    sender->withdrawn = sender->withdrawn || (sender->state != STATE_RUN && since_us > 0);
+    if (!sender->withdrawn) {
+        sender->running_us = sender->time_us;
+    }
+    return since_us < RECOVERY_OFF_US || sender->time_us < sender->running_us + WITHDRAWN_US;
+}
+
 static sender_request_t wanted(sender_t *sender) {
     const world_t *world = sender->world;
     const bool recovers = world->recovery_us && sender->time_us >= world->recovery_us;
@@ -70,10 +82,10 @@ static sender_request_t wanted(sender_t *sender) {
         sender->phase_us = sender->time_us;
     }
     sender->last_state = sender->state;
-    if (recovers && sender->time_us < world->recovery_us + RECOVERY_OFF_US) {
+    if (recovers && withdraws(sender)) {
         /* A lost phase is used again after clear_fault, even where its loss was no fault. */
         const bool later = sender->time_us >= world->recovery_us + RECOVERY_OFF_US / 2;
-        return later && has(sender, WORLD_DEGRADED) ? SENDER_CLEAR : SENDER_OFF;
+        return later && sender->withdrawn && has(sender, WORLD_DEGRADED) ? SENDER_CLEAR : SENDER_OFF;
     }
     const world_event_t *request = active(sender, WORLD_REQUEST);
     if (request && !recovers) {

@@ -52,6 +52,8 @@ typedef struct sender {
     uint8_t counter, arm_counter;
     uint8_t followed;          /* counter of the last motion command that a receiver may follow */
     uint8_t state, last_state; /* of the drive, by DRIVE_STATUS */
+    bool withdrawn;            /* after the faults the drive has left its run, */
+    uint64_t running_us;       /* and was last in it */
     bool armed;
     unsigned configured;    /* sessions of configuration that are over, */
     uint64_t resting_us;    /* and until when it waits */

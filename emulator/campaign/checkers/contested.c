@@ -1,5 +1,5 @@
 /* A drive does not run for 150 ms while another client sends commands, or forged ones, or frames that are the drive's.
- * Where the drive may receive no command, or late, it has nothing to judge by. */
+ * Where the drive may receive no command, or late, or after a bus-off follows none, it has nothing to judge by. */
 #include "campaign/checkers/checker.h"
 
 #define TIME_NS (150 * MS_NS)
@@ -13,7 +13,7 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
     (void)memory;
     const uint64_t now_us = seen->time_ns / 1000;
     if (seen->drive.state != STATE_RUN || facts_state_changed(seen) || seen->client.succeeded ||
-        facts_variable(seen, VARIABLE_LOSES_COMMANDS)) {
+        facts_variable(seen, VARIABLE_LOSES_COMMANDS) || facts_may_be_unarmed(seen)) {
         return;
     }
     for (unsigned i = 0; i < seen->world->events; i++) {

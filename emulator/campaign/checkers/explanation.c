@@ -16,9 +16,10 @@
 
 #define STALLED_NS (100 * MS_NS) /* without a stroke */
 #define CONDUCTED_MAX_NS (250 * MS_NS)
-#define LOADED 0.9        /* of the torque that is left */
-#define LOADED_BACK 0.7   /* likewise, of one quadrant turned back */
-#define COASTING_NS MS_NS /* without a gate */
+#define STALL_CHANGE (1.0 / 128.0) /* of the reference: a change of the speed within STALLED_NS is no stall */
+#define LOADED 0.9                 /* of the torque that is left */
+#define LOADED_BACK 0.7            /* likewise, of one quadrant turned back */
+#define COASTING_NS MS_NS          /* without a gate */
 
 /* --- True of the plant --- */
 
@@ -30,13 +31,24 @@ static double torque_left_Nm(const observation_t *seen) {
     return fmin(announced_Nm, facts_cool_part(heat.winding_C, heat.switch_C) * facts_torque_max_Nm(seen));
 }
 
-/* The load is the torque that is left. A rotor that a load turns backwards has less of it in the mean: one quadrant
- * takes the phases in the order of forward motion, and backwards each of them ends its part where its torque, at the
- * limit of the current, is small. */
+/* Load and friction leave too little of the torque to change the speed in the time of a stall. A rotor that a load
+ * turns backwards has less of it in the mean: one quadrant takes the phases in the order of forward motion, and
+ * backwards each of them ends its part where its torque, at the limit of the current, is small. */
 static bool overloaded(const observation_t *seen) {
     const plant_t *plant = seen->plant;
     const bool driven_back = !facts_four_quadrants(seen) && plant->speed_rad_s < 0.0 && plant->load_torque_Nm > 0.0;
-    return fabs(plant->load_torque_Nm) > (driven_back ? LOADED_BACK : LOADED) * torque_left_Nm(seen);
+    const double used_Nm = fabs(plant->load_torque_Nm) + fmax(plant->faults.coulomb_Nm, plant->faults.static_Nm);
+    const double change_rad_s = STALL_CHANGE * fabs(seen->client.meant.reference) / RPM_PER_RAD_S;
+    const double inertia_kg_m2 = plant->machine->inertia_kg_m2 * seen->world->inertia_gain;
+    const double needed_Nm = seen->client.meant.torque ? 0.0 : inertia_kg_m2 * change_rad_s / (1e-9 * STALLED_NS);
+    return used_Nm + needed_Nm > (driven_back ? LOADED_BACK : LOADED) * torque_left_Nm(seen);
+}
+
+/* A drive with a phase less does not get over the angles at which the others make no torque. */
+static bool held_by_lost_phase(const observation_t *seen) {
+    const double reference_rad_s = seen->client.meant.reference / RPM_PER_RAD_S;
+    return facts_may_be_degraded(seen) && !seen->client.meant.torque &&
+           seen->plant->speed_rad_s * reference_rad_s < 0.5 * reference_rad_s * reference_rad_s;
 }
 
 static bool true_of_plant(const observation_t *seen, unsigned cause) {
@@ -55,7 +67,8 @@ static bool true_of_plant(const observation_t *seen, unsigned cause) {
         return fmax(recent->speed_rad_s, fabs(seen->plant->speed_rad_s)) * RPM_PER_RAD_S >
                0.95 * machine->over_speed_rpm;
     case CAUSE(STALL):
-        return seen->time_ns > seen->rotor.stroke_ns + STALLED_NS || seen->rotor.swings || overloaded(seen);
+        return seen->time_ns > seen->rotor.stroke_ns + STALLED_NS || seen->rotor.swings || overloaded(seen) ||
+               held_by_lost_phase(seen);
     default:
         return false;
     }

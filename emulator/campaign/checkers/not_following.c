@@ -1,5 +1,6 @@
-/* Undisturbed, at a constant speed reference and under a constant load, the mean speed over 50 ms and a revolution is
- * the commanded one: within 0.3 %, 0.1 % of the base speed and a count; of one quadrant not below it by 2 %. */
+/* Undisturbed and with all phases, at a constant speed reference and under a constant load, the mean speed over 50 ms
+ * and a revolution is the commanded one: within 0.3 %, 0.1 % of the base speed and a count; of one quadrant not below
+ * it by 2 %. */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>
@@ -42,8 +43,8 @@ static bool follows(const observation_t *seen) {
     const uint64_t since_ns = client->constant_ns > seen->state_ns ? client->constant_ns : seen->state_ns;
     return facts_runs_by_speed(seen) && facts_undisturbed(seen) && !facts_derated(seen) && facts_heard(seen) &&
            seen->time_ns > since_ns + (uint64_t)((SETTLED_S + facts_needed_s(seen, change_rad_s)) * 1e9) &&
-           reference_rpm <= SPEED_MAX * base_rpm && !facts_overhauled(seen, seen->plant->speed_rad_s) &&
-           load_is_constant(seen);
+           reference_rpm <= SPEED_MAX * base_rpm && !facts_may_be_degraded(seen) &&
+           !facts_overhauled(seen, seen->plant->speed_rad_s) && load_is_constant(seen);
 }
 
 static void judge(const observation_t *seen, checker_report_t *report, double mean_rad_s, double time_s) {

@@ -1,5 +1,5 @@
-/* State run is left, without a fault, only by a request to switch off, after a silence, or at rest after a request to
- * stop. */
+/* State run is left, without a fault, only by a request to switch off, after a silence, at rest after a request to
+ * stop, or by a request to run that is off because a bus-off has disarmed the drive. */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>
@@ -25,7 +25,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     const uint64_t now_ns = seen->time_ns, run_ns = seen->client.run_ns;
     const uint64_t age_ns = now_ns > run_ns ? now_ns - run_ns : 0;
     if (!seen->client.off_seen && !rests(seen) && age_ns < AGE_MAX_NS && !facts_state_changed(seen) &&
-        !facts_may_be_deaf(seen)) {
+        !facts_may_be_deaf(seen) && !facts_may_be_unarmed(seen)) {
         checker_violated(report, seen->client.meant.request, seen->plant->speed_rad_s);
     }
 }

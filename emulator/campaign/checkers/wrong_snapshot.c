@@ -14,7 +14,7 @@ enum { SPEED = 16, LINK_VOLTAGE, CURRENT };
 
 typedef struct {
     double speed_rpm, voltage, current; /* when the fault was latched; as fractions of the full scales */
-    bool observed;                      /* the speed, by a run of long until then */
+    bool observed;                      /* the speed, by a run of long and all interrupts until then */
 } state_t;
 
 static void on_interrupt(const observation_t *seen, void *memory, checker_report_t *report) {
@@ -23,10 +23,10 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     if (seen->drive.state != STATE_FAULT || seen->before == STATE_FAULT) {
         return;
     }
-    *state =
-        (state_t){.speed_rpm = seen->plant->speed_rad_s * RPM_PER_RAD_S,
-                  .voltage = seen->drive.link_voltage,
-                  .observed = seen->before == STATE_RUN && seen->before_ns > RAN_NS && facts_speed_is_observed(seen)};
+    *state = (state_t){.speed_rpm = seen->plant->speed_rad_s * RPM_PER_RAD_S,
+                       .voltage = seen->drive.link_voltage,
+                       .observed = seen->before == STATE_RUN && seen->before_ns > RAN_NS &&
+                                   facts_speed_is_observed(seen) && !facts_checks_late(seen)};
     for (unsigned phase = 0; phase < seen->plant->machine->phases; phase++) {
         state->current = fmax(state->current, seen->drive.current[phase]);
     }
