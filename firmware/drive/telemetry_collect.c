@@ -6,6 +6,7 @@
 #include "interrupts/deferred.h"
 #include "interrupts/speed_control.h"
 #include "interrupts/torque_control.h"
+#include "monitors/available_torque.h"
 
 /* Gain of the BP-PID in duty per N m, Q15, from duty per scaled error. */
 static uint32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
@@ -59,6 +60,39 @@ static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry)
     telemetry->degraded.torque_least_nm = units_torque_q8(lost && state->mean_q24 != 0 ? state->least_q24 : 0);
     telemetry->degraded.torque_here_nm = units_torque_q8(
         lost ? degraded_torque_q24(&drive->control_parameters.degraded, state, &machine_tables, electrical) : 0);
+}
+
+static int32_t by_heat_q24(const drive_t *drive) {
+    const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->control_parameters.thermal, &drive->thermal);
+    return fixed_min(thermal_q24, drive->temperature.torque_limit_q24);
+}
+
+static void collect_available_torque(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const control_state_t *control = &drive->control;
+    const conduction_state_t *conduction = &control->deferred.conduction;
+    const int32_t speed_q22 = control->observer.speed_q22, mean_q24 = drive->degraded.mean_q24;
+    const bool brakes = parameters->torque_law == TORQUE_LAW_PREDICTIVE && !conduction_at_rest(speed_q22);
+    const available_torque_input_t input = {
+        .run = control->state_machine.state == DRIVE_STATE_RUN,
+        .four_quadrant = parameters->conduction.torque_min_q24 < 0,
+        .speed_q22 = speed_q22,
+        .load_torque_q24 =
+            fixed_add(control->observer.load_torque_q24, deferred_in_effect(control)->speed.periodic_load_q24),
+        .largest_q24 = parameters->conduction.torque_max_q24,
+        .by_voltage_q24 = {conduction->torque_max_q24, -conduction->torque_min_q24},
+        .link_fills = conduction->room_q15 < 1u << 15,
+        .by_link_q24 = brakes ? conduction_braking_q24(&parameters->conduction, control->measurement.dc_link_voltage_q6)
+                              : INT32_MAX,
+        .by_heat_q24 = by_heat_q24(drive),
+        .by_degraded_q24 = drive->degraded.lost != 0 && mean_q24 != 0 ? mean_q24 : INT32_MAX,
+    };
+    const available_torque_t available = available_torque(&input);
+    telemetry->available_torque.forward_nm = units_torque_q8(available.forward.torque_q24);
+    telemetry->available_torque.backward_nm = units_torque_q8(-available.backward.torque_q24);
+    telemetry->available_torque.forward_limited_by = available.forward.limited_by;
+    telemetry->available_torque.backward_limited_by = available.backward.limited_by;
+    telemetry->available_torque.load_exceeds = available.load_exceeds;
 }
 
 /* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
@@ -174,6 +208,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     collect_degraded(drive, telemetry);
 
     collect_estimates(drive, telemetry);
+
+    collect_available_torque(drive, telemetry);
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;

@@ -231,3 +231,21 @@ def test_unknown_or_ambiguous_signal_is_one_line_with_those_there_are(salient_wi
     assert (result.stdout, result.returncode) == ("", 2)
     assert result.stderr.count("\n") == 1
     assert all(word in result.stderr for word in [f"--signals {name}: ", *words]), result.stderr
+
+
+def test_monitor_tells_that_a_load_exceeds_the_torque_and_what_limits_it(make_bench):
+    bench = make_bench(machine="finite_element", controller="salient")
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.5)
+    bench.fault("chopper_open")
+    bench.rig.load_torque_Nm = -8
+    bench.run_for(0.15)
+    shown = monitor._MainSignals(monitor.drive_database("finite_element"))
+    lines = []
+    for time_ns, message in bench.log:
+        shown.add(time_ns, message)
+        if message.arbitration_id == 0x182 and not message.is_extended_id:  # DRIVE_TORQUE
+            lines.append((time_ns * 1e-9, shown.line(time_ns)))
+    telling = [(time_s, line) for time_s, line in lines if "load exceeds the torque backward, " in line]
+    assert 0.5 < telling[0][0] < 0.61
+    assert all(line.endswith("by dc_link") for _, line in telling) and telling[-1] == lines[-1]

@@ -134,15 +134,28 @@ def _report_closed(address: str, duration_s: float | None, reason: str) -> int:
 
 
 class _MainSignals:
-    """The signals of _COLUMNS, and the check that keeps the drive from starting."""
+    """The signals of _COLUMNS, the check that keeps the drive from starting, and the direction in which the load
+    exceeds the torque, with what limits it."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._telemetry = SignalTable(database, "DRIVE")
+        self._exceeded = ""
 
     def add(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame."""
         self._telemetry.add(time_ns, message)
+        if self._telemetry.count("DRIVE_AVAILABLE_TORQUE"):
+            self._exceeded = self._exceeding()
+
+    def _exceeding(self) -> str:
+        available = {name: self._telemetry[f"DRIVE_AVAILABLE_TORQUE.{name}"] for name in (
+            "load_exceeds", "forward_Nm", "backward_Nm", "forward_limited_by", "backward_limited_by")}
+        if available["load_exceeds"].last_name != "yes":
+            return ""
+        side = min(("forward", "backward"), key=lambda side: abs(available[f"{side}_Nm"].last))
+        return (f"load exceeds the torque {side}, {available[f'{side}_Nm'].last:.2f} N m by "
+                f"{available[f'{side}_limited_by'].last_name}")
 
     def line(self, time_ns: int) -> str:
         """The values at a time; empty when the drive has sent none since the last line."""
@@ -157,4 +170,6 @@ class _MainSignals:
         held = telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
         if held not in ("none", "unknown"):
             cells.append(f"start inhibited by {held}")
+        if self._exceeded:
+            cells.append(self._exceeded)
         return "  ".join(cells)

@@ -39,6 +39,10 @@ class Page {
         this.status = this.store.watch("DRIVE_STATUS.state");
         this.fault = this.store.watch("DRIVE_STATUS.fault");
         this.inhibited = this.store.watch("DRIVE_STATUS.start_inhibited_by");
+        const available = (name) => this.store.watch(`DRIVE_AVAILABLE_TORQUE.${name}`);
+        this.available = [["forward", "+"], ["backward", "\u2212"]].map(([side, sign]) =>
+            ({ sign, torque: available(`${side}_Nm`), limit: available(`${side}_limited_by`) }));
+        this.exceeds = available("load_exceeds");
         this.hash = this.store.watch("DRIVE_IDENTITY.dbc_hash");
         this.health = { at_ms: performance.now(), frames: 0, drawn: 0 };
         this.free_ms = 0;
@@ -336,7 +340,14 @@ class Page {
         const badge = element("state");
         badge.textContent = state || "no data";
         badge.className = `badge ${state === "run" ? "run" : state === "fault" ? "bad" : ""}`;
-        const because = state === "fault" ? fault : state === "initialise" && check !== "none" ? check : "";
+        const sides = this.available.map(({ sign, torque, limit }) =>
+            ({ torque: Math.abs(torque.at(at_ns)), limit: name(limit), sign }));
+        const least = sides[0].torque < sides[1].torque ? sides[0] : sides[1];
+        const beyond = state === "run" && name(this.exceeds) === "yes" ? `load exceeds torque, ${least.limit}` : "";
+        const because = state === "fault" ? fault : state === "initialise" && check !== "none" ? check : beyond;
+        element("available").textContent = sides.every((side) => Number.isFinite(side.torque))
+            ? `Available torque: ${sides.map(({ sign, torque, limit }) =>
+                `${sign}${torque.toFixed(1)} N m (${limit.replaceAll("_", " ")})`).join(", ")}.` : "";
         element("fault").textContent = because.replaceAll("_", " ");
         element("fault").hidden = because === "";
     }
