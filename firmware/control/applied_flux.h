@@ -1,8 +1,8 @@
 /* Flux linkage that the applied voltage has built up in each phase: the integral of Faraday's law alone, from the
  * duties, whatever the current sensors say but for the resistive drop.
  *
+ *   psi(k) = max(0, psi(k))                               without current: the diodes block a reverse one
  *   psi(k+1) = psi(k) + Ts (duty Vdc - R i)               forward Euler
- *   psi(k+1) = max(0, psi(k+1))                           without current: the diodes block a reverse one
  *
  * Both switches off are the duty -1: full opposite voltage until the flux linkage has gone. A phase that is off once in
  * an electrical revolution begins at 0 each time. Drops of the devices and errors of R and Vdc accumulate; the caller
@@ -20,7 +20,7 @@
 
 typedef struct {
     int32_t at_sample_q29[HAL_PHASES_MAX]; /* at the last sample, Wb, Q2.29 */
-    int32_t next_q29[HAL_PHASES_MAX];      /* at the coming sample, Wb, Q2.29 */
+    int32_t next_q29[HAL_PHASES_MAX];      /* at the coming sample, if it has a current, Wb, Q2.29 */
 } applied_flux_t;
 
 /* Vdc Ts, Wb, Q2.29. dc_link_voltage_q6: V, Q9.6, below 2^16; period_q40: Ts, s, Q-9.40. */
@@ -87,15 +87,17 @@ ALWAYS_INLINE applied_flux_period_t applied_flux_period(int32_t dc_link_voltage_
 }
 
 /* One period of a phase, which begins with the sample. duty_q15: acts in this period, -32768..32768; current_q9: A,
- * Q7.9, below 2^16. Both products are rounded to 1 LSB, the sum saturates. */
+ * Q7.9, below 2^16. Both products are rounded to 1 LSB, the sum saturates. A voltage that has ended the current within
+ * a period has not made the flux linkage negative: without a current the sample begins at 0, before the new voltage
+ * acts. */
 ALWAYS_INLINE void applied_flux_step(applied_flux_t *flux, const applied_flux_period_t *period, unsigned phase,
                                      int32_t duty_q15, int32_t current_q9) {
-    const int32_t now_q29 = flux->next_q29[phase];
+    const int32_t before_q29 = flux->next_q29[phase];
+    const int32_t now_q29 = current_q9 > period->none_q9 ? before_q29 : fixed_non_negative(before_q29);
     const int32_t gained_q29 = fixed_multiply_high(duty_q15 * (1 << 14), period->full_q32); /* Q15 Q29 to Q29 */
     const int32_t change_q29 = fixed_multiply_high_add(gained_q29, current_q9 << 12, period->against_q40);
-    const int32_t then_q29 = fixed_add(now_q29, change_q29);
     flux->at_sample_q29[phase] = now_q29;
-    flux->next_q29[phase] = current_q9 > period->none_q9 ? then_q29 : fixed_non_negative(then_q29);
+    flux->next_q29[phase] = fixed_add(now_q29, change_q29);
 }
 
 #endif

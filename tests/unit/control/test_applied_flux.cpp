@@ -36,12 +36,12 @@ TEST(AppliedFlux, follows_the_sum_of_voltage_less_resistive_drop_within_2_LSB_a_
             applied_flux_period(to_fixed(voltage, 64.0), to_fixed(PERIOD_S, Q40), resistance_q40, RANGE_Q9);
         for (int phase = 0; phase < 3; phase++) {
             applied_flux_step(&flux, &period, unsigned(phase), duty_q15[phase], current_q9[phase]);
-            EXPECT_NEAR(flux.at_sample_q29[phase] / Q29, model[phase], 1e-5);
             const double drop = current_q9[phase] / 512.0 * resistance_q40 / Q40;
             const bool none = current_q9[phase] <= int32_t(RANGE_Q9 / 64);
-            const double then = model[phase] + duty_q15[phase] / 32768.0 * period_q29 / Q29 - drop;
-            model[phase] = none ? std::max(0.0, then) : then;
-            least = std::min(least, then);
+            const double now = none ? std::max(0.0, model[phase]) : model[phase];
+            EXPECT_NEAR(flux.at_sample_q29[phase] / Q29, now, 1e-5);
+            model[phase] = now + duty_q15[phase] / 32768.0 * period_q29 / Q29 - drop;
+            least = std::min(least, model[phase]);
             worst = std::max(worst, std::abs(flux.next_q29[phase] / Q29 - model[phase]));
             most = std::max(most, model[phase]);
         }
@@ -65,8 +65,23 @@ TEST(AppliedFlux, saturates_and_ends_at_0_without_a_current) {
         applied_flux_step(&flux, &period, 3, OFF, 0);
     }
     applied_flux_step(&flux, &period, 3, OFF, 0);
-    EXPECT_EQ(flux.next_q29[3], 0);
+    applied_flux_step(&flux, &period, 3, OFF, 0);
+    EXPECT_EQ(flux.at_sample_q29[3], 0);
     EXPECT_EQ(flux.next_q29[0], 0);
+}
+
+// As at the end of a start at 20 kHz, where the opposite voltage of a period is several times the flux linkage.
+TEST(AppliedFlux, a_pulse_after_a_period_that_ended_the_current_begins_at_0) {
+    const applied_flux_period_t period = {.full_q32 = 1 << 26, .against_q40 = 0, .none_q9 = 640};
+    applied_flux_t flux{};
+    applied_flux_step(&flux, &period, 0, 8192, 0);
+    EXPECT_EQ(flux.next_q29[0], 1 << 21);
+    applied_flux_step(&flux, &period, 0, -32768, 6400);
+    EXPECT_EQ(flux.at_sample_q29[0], 1 << 21);
+    applied_flux_step(&flux, &period, 0, 16384, 0);
+    EXPECT_EQ(flux.at_sample_q29[0], 0);
+    applied_flux_step(&flux, &period, 0, 0, 6400);
+    EXPECT_EQ(flux.at_sample_q29[0], 1 << 22);
 }
 
 TEST(AppliedFlux, falls_below_0_while_there_is_a_current) {
@@ -75,8 +90,8 @@ TEST(AppliedFlux, falls_below_0_while_there_is_a_current) {
     applied_flux_step(&flux, &period, 0, -32768, 641);
     EXPECT_EQ(flux.next_q29[0], -(1 << 17));
     applied_flux_step(&flux, &period, 0, -32768, 640);
-    EXPECT_EQ(flux.at_sample_q29[0], -(1 << 17));
-    EXPECT_EQ(flux.next_q29[0], 0);
+    EXPECT_EQ(flux.at_sample_q29[0], 0);
+    EXPECT_EQ(flux.next_q29[0], -(1 << 17));
 }
 
 } // namespace
