@@ -22,6 +22,7 @@ from salient.bench.rig import RigError, bench_variables
 from salient.bench.session import Session, SessionError
 from salient.bus.signals import drive_database, rig_database
 from salient.config import BenchConfig
+from salient.errors import UsageError
 
 FAILING_TEST = """
 import pytest
@@ -101,7 +102,7 @@ def test_signals_have_units_times_and_names(bench):
     assert len(speed.between(0.005, 0.010)) == 5
     assert bench.telemetry["DRIVE_STATUS.state"].last_name == bench.drive.state == "ready"
     assert bench.telemetry["bus_voltage_V"].last == pytest.approx(240, abs=0.5)
-    with pytest.raises(KeyError, match="no signal 'speed'; the signals are .*speed_rpm"):
+    with pytest.raises(KeyError, match="no signal 'speed'; the nearest of .* are .*speed_rpm"):
         bench.telemetry["speed"]
     none = bench.telemetry["DRIVE_FAULT_CAUSE.fault"]
     assert (len(none), np.isnan(none.last), none.last_name) == (0, True, "unknown")
@@ -248,22 +249,52 @@ def test_invalid_transport_is_rejected(tmp_path):
     assert "--salient-can vcan0: must be local, unix:PATH or socketcan:INTERFACE" in result.stderr
 
 
-@pytest.mark.parametrize("name", ["phase_a_open", "load_torque", "Load_torque_Nm", "_load_torque_Nm"])
-def test_unknown_bench_variable_is_rejected_with_the_valid_names(bench, name):
+@pytest.mark.parametrize(("name", "nearest"), [
+    ("phase_a_open", ""), ("load_torqe_Nm", "load_torque_Nm, "), ("load_torque", "load_torque_Nm, "),
+    ("Load_torque_Nm", "load_torque_Nm, "), ("_load_torque_Nm", "load_torque_Nm, "),
+])  # fmt: skip
+def test_unknown_bench_variable_is_rejected_with_the_nearest_names(bench, name, nearest):
     for rig in (bench.rig, bench.at(0.1)):
-        with pytest.raises(AttributeError, match=f"no attribute '{name}'; there are .*load_torque_Nm.*truth_period_us"):
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; the nearest of .* are {nearest}"):
             setattr(rig, name, 8)
         with pytest.raises(AttributeError, match=f"no attribute '{name}'"):
             getattr(rig, name)
 
 
 def test_misspelt_attribute_is_rejected_with_the_valid_names(bench):
-    with pytest.raises(AttributeError, match="no attribute 'load_torque'; there are .*load_torque_Nm"):
+    with pytest.raises(AttributeError, match="no attribute 'load_torque'; the nearest of .* are load_torque_Nm, "):
         bench.load_torque = 8
-    with pytest.raises(AttributeError, match="no attribute 'speed_rpm'; there are .*speed_reference_rpm"):
+    with pytest.raises(AttributeError, match="no attribute 'speed_rpm'; the nearest of .* are .*speed_reference_rpm"):
         bench.drive.speed_rpm = 600
     with pytest.raises(AttributeError, match="no attribute 'stop'"):
         bench.drive.stop = True  # a method
+    with pytest.raises(AttributeError, match="no attribute 'telemtry'; the nearest of .* are telemetry, "):
+        _ = bench.telemtry
+    with pytest.raises(AttributeError, match="no attribute 'lowest_speed'; the nearest of .* are lowest_speed_rpm, "):
+        _ = bench.drive.lowest_speed
+
+
+def test_error_within_a_property_is_its_own(bench, monkeypatch):
+    monkeypatch.setattr(type(bench), "time_s", property(lambda self: self.time_ns.missing))
+    with pytest.raises(AttributeError, match="'int' object has no attribute 'missing'"):
+        _ = bench.time_s
+
+
+def test_misspelt_signal_names_the_nearest(bench):
+    for name, nearest in (("sped_rpm", "speed_rpm"), ("RIG_TRUTH_MOTION.torqe_Nm", "RIG_TRUTH_MOTION.torque_Nm")):
+        with pytest.raises(KeyError) as caught:
+            bench.truth[name]
+        assert f"no signal '{name}'; " in str(caught.value) and nearest in str(caught.value)
+        assert len(str(caught.value)) < 160
+    with pytest.raises(KeyError, match="no signal 'bus_voltage'; the nearest of .* are bus_voltage_V, "):
+        bench.telemetry["bus_voltage"]
+    with pytest.raises(KeyError, match="no message 'DRIVE_STATE'; the nearest of .*DRIVE_STATUS"):
+        bench.telemetry.count("DRIVE_STATE")
+
+
+def test_misspelt_option_names_the_nearest(make_bench):
+    with pytest.raises(UsageError, match="bench option 'controler': no such option; .* are controller, "):
+        make_bench(controler="paper")
 
 
 def test_bench_variables_are_those_of_the_database(bench):

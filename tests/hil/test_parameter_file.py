@@ -76,7 +76,7 @@ def test_each_bad_entry_is_one_line_and_nothing_is_set(can, tmp_path: Path):
         lines = result.stderr.splitlines()
         assert len(lines) == 5 and all(line.startswith(f"salient: {file}: ") for line in lines)
         texts = [line.removeprefix(f"salient: {file}: ") for line in lines]
-        assert texts[0].startswith("'speed': unknown parameter; the parameters are controller, ")
+        assert texts[0].startswith("'speed': unknown parameter; the nearest of ")
         assert texts[1] == "current_trip_A: 99: must be a number from 1.0 to 79.0 A"
         assert texts[2] == "current_limit_A: 'much': must be a number from 1.0 to 79.0 A"
         assert texts[3] == "angle_adaptation: True: must be a number from 0 to 1"

@@ -69,7 +69,9 @@ def test_conditions_are_optional(tmp_path):
     ("adc_bits = 11", "adc_bits: 11: must be a whole number from 12 to 16"),
     ("encoder_edges = 1", "encoder_edges: 1: must be true or false"),
     ('immediate_pwm = "yes"', "immediate_pwm: 'yes': must be true or false"),
-    ("[bench]\ngain = 1", "bench.gain: unknown key; must be one of load_torque_Nm, "),
+    ("[bench]\ngain = 1", "bench.gain: unknown key; the nearest of "),
+    ("[bench]\nload_torqe_Nm = 1", f"bench.load_torqe_Nm: unknown key; the nearest of {len(bench_variables())} are "
+     "load_torque_Nm, "),
     ("[bench]\nflux_linkage_gain = 0.1", "bench.flux_linkage_gain: 0.1: must be a number from 0.2 to 5"),
     ("[bench]\nencoder_offset_deg = 5.1", "bench.encoder_offset_deg: 5.1: must be a number from -5 to 5"),
     ("[bench]\nminimum_pulse_ns = true", "bench.minimum_pulse_ns: True: must be a number from 0 to 2000"),

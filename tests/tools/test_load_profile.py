@@ -69,6 +69,6 @@ def test_scenario_names_a_bundled_profile_or_a_file_next_to_it(tmp_path):
         assert scenario.load_profile == expected
         assert scenario.load == (LoadStep(0.0, 1.0, 2.0),)
     path.write_text(f'{SCENARIO}load_profile = "compressor"\n')
-    names = r"\(compressor_one_cylinder, compressor_two_cylinders\)"
-    with pytest.raises(UsageError, match=f"no such file, and no bundled load profile of that name {names}"):
+    names = "; must be one of compressor_one_cylinder, compressor_two_cylinders"
+    with pytest.raises(UsageError, match=f"no such file, and no bundled load profile of that name{names}"):
         load_scenarios(path)

@@ -221,12 +221,14 @@ def test_monitor_shows_chosen_signals_of_both_databases_with_units_and_names(lis
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("nonsense", ["no such signal", "speed_rpm", "held_speed_rpm", "dbc_hash"]),
+        ("sped_rpm", ["no such signal; the nearest of ", " are speed_rpm, held_speed_rpm, "]),
+        ("DRIVE_MOTOIN.speed_rpm", ["no such signal; the nearest of ", " are DRIVE_MOTION.speed_rpm, "]),
+        ("nonsense", ["no such signal; the nearest of "]),
         ("DRIVE_MOTION.nonsense", ["no such signal", "DRIVE_MOTION.speed_rpm", "DRIVE_MOTION.rotor_angle_deg"]),
         ("speed_rpm", ["in several messages", "DRIVE_MOTION.speed_rpm", "RIG_TRUTH_MOTION.speed_rpm"]),
     ],
 )
-def test_unknown_or_ambiguous_signal_is_one_line_with_those_there_are(salient_without_build, name, words):
+def test_unknown_or_ambiguous_signal_is_one_line_with_the_nearest(salient_without_build, name, words):
     result = salient_without_build("monitor", "--can", "unix:none", "--signals", "DRIVE_STATUS.state", name)
     assert (result.stdout, result.returncode) == ("", 2)
     assert result.stderr.count("\n") == 1

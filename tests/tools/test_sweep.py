@@ -139,7 +139,8 @@ def test_no_column_of_metrics_is_the_name_of_a_setting():
 
 
 @pytest.mark.parametrize(("arguments", "error"), [
-    (("--set", "torque_max=3"), "--set torque_max=3: torque_max: must be a parameter of the drive"),
+    (("--set", "torque_max=3"), "--set torque_max=3: torque_max: neither a parameter of the drive nor a "
+     "variable of the test bench; the nearest of"),
     (("--set", "torque_max_Nm"), r"must be NAME=VALUE\[,VALUE...\] or NAME=FIRST:LAST:COUNT"),
     (("--set", "torque_max_Nm=1:2:1"), "must be NAME=VALUE"),
     (("--set", "torque_max_Nm=5,5"), "finite and different"),

@@ -122,7 +122,7 @@ def test_refused_command_names_what_is_allowed_and_sends_nothing(tab):
     speed, load, kind, place, parameter = (answer["message"] for answer in made["answers"])
     assert re.fullmatch(r"speed_reference_rpm 1000000: must be -\d+(\.\d+)? to \d+(\.\d+)? r/min", speed)
     assert load == "load_torque_Nm 1000000: must be -10000 to 10000 N m"
-    assert (kind, place) == ("no fault 'none_such'", "winding_open: phase missing")
+    assert kind.startswith("no fault 'none_such'") and place == "winding_open: phase missing"
     assert re.fullmatch(r"torque_max_Nm 1000000: must be 0 to \d+ N m", parameter)
     assert len(set(made["hashes"][:5])) == 1
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import UsageError, exit_code
-from salient.paths import BUILD, SCENARIOS, make_folder
+from salient.paths import BUILD, make_folder, scenario_path
 
 
 def main() -> int:
@@ -70,9 +70,7 @@ def _sim(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     from salient.experiments.scenario import load_scenarios, run_all
 
-    if (bundled := SCENARIOS / f"{options.scenario}.toml").is_file():
-        options.scenario = bundled
-    scenarios = load_scenarios(options.scenario)
+    scenarios = load_scenarios(scenario_path(options.scenario))
     out = options.out or Path("out") / options.scenario.stem
     make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,

@@ -23,6 +23,7 @@ from salient.config import (
     either,
     flag_of,
 )
+from salient.errors import close_names
 from salient.paths import BUILD, COMMAND, IS_WHEEL
 from salient.version import VERSION
 
@@ -37,14 +38,34 @@ CHANGE_PERCENT = 10.0
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line and exit code 2."""
-        command = re.match(r"argument (COMMAND|ACTION): invalid choice: '(.*?)' \(choose from (.*)\)", message)
-        if command:
-            message = f"no {command[1].lower()} {command[2]}: must be one of {command[3]}".replace("'", "")
         message = re.sub(r"^argument ([^:]*): expected one argument$", r"\1: requires a value", message)
         message = re.sub(r"^argument ([^:]*): ", r"\1 ", message)
-        message = message.replace("unrecognized arguments:", "unrecognised argument")
-        print(f"salient: {message} ({self.prog} --help)", file=sys.stderr)
+        print(f"salient: {' '.join(message.splitlines())} ({self.prog} --help)", file=sys.stderr)
         sys.exit(2)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:  # COMMAND or ACTION: no option has choices
+            self.error(f"no {str(action.metavar).lower()} {value}: {close_names(value, action.choices)}")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Names a misspelt option ahead of what is missing because of it, and leaves no argument to the parser above,
+        which knows the options of no command."""
+        for option in sys.argv[1:] if args is None else args:
+            if option == "--" or (self._subparsers and not option.startswith("-")):
+                break  # the rest is for the command
+            name = option.partition("=")[0]
+            if name.startswith("--") and " " not in name and not any(
+                    known.startswith(name) for known in self._option_string_actions):
+                self._unrecognised(name)
+        parsed, others = super().parse_known_args(args, namespace)
+        if others:
+            self._unrecognised(" ".join(others))
+        return parsed, others
+
+    def _unrecognised(self, text: str) -> NoReturn:
+        options = [name for name in self._option_string_actions if name.startswith("--")]
+        near = f"; {close_names(text.split(maxsplit=1)[0], options)}" if text.startswith("-") else ""
+        self.error(f"unrecognised argument {text}{near}")
 
 
 def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of commands and options, without a branch

@@ -1,7 +1,8 @@
 """Mistakes of the user, as opposed to failures."""
 
+import difflib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 
 class UsageError(Exception):
@@ -18,6 +19,27 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):
         return "a value too long to show"
     return text if len(text) <= SHOWN_MAX else f"{text[:SHOWN_MAX]}..."
+
+
+NAMES_MAX = 8
+"""As many names a message lists in full."""
+_NEAREST = 3
+
+
+def close_names(name: object, known: Iterable[str]) -> str:
+    """The end of a message about a name that does not exist: all names where they are few, else the nearest three.
+    Nearest first: those that contain the name, then by the share of characters that agree, without regard to case."""
+    names = list(dict.fromkeys(known))
+    if len(names) <= NAMES_MAX:
+        listed = f"must be {'one of ' if names[1:] else ''}{', '.join(names)}"
+        return listed if names else "there is none"
+    wanted = str(name)[:SHOWN_MAX].lower()
+
+    def distance(candidate: str) -> tuple[bool, float]:
+        text = candidate.lower()
+        return (not wanted or wanted not in text, -difflib.SequenceMatcher(None, wanted, text, autojunk=False).ratio())
+
+    return f"the nearest of {len(names)} are {', '.join(sorted(names, key=distance)[:_NEAREST])}"
 
 
 class RunFailed(Exception):

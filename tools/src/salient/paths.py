@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from salient.errors import UsageError, cannot_write, shown
+from salient.errors import UsageError, cannot_write, close_names, shown
 
 _DATA = Path(__file__).resolve().parent / "data"
 IS_WHEEL = _DATA.is_dir()
@@ -54,6 +54,17 @@ def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str) -> P
             return path.resolve()
     except OSError:
         pass  # a name too long for a file: there is none
-    names = ", ".join(sorted(p.stem for p in folder.glob(f"*{suffix}")))
-    raise UsageError(f"{key} {shown(name_or_path)}: no such file, and no bundled {key.replace('_', ' ')} of that name"
-                     f" ({names})")
+    names = sorted(p.stem for p in folder.glob(f"*{suffix}"))
+    raise UsageError(f"{key} {shown(name_or_path)}: no such file, and no bundled {key.replace('_', ' ')} of that name; "
+                     f"{close_names(path.stem, names)}")
+
+
+def scenario_path(name_or_path: Path) -> Path:
+    """The file of a bundled scenario by its name, else the path as it was given; UsageError when nothing is there."""
+    try:
+        found = bundled_or_path(str(name_or_path), SCENARIOS, ".toml", "scenario")
+    except UsageError:
+        if not os.path.lexists(name_or_path):
+            raise
+        return name_or_path
+    return found if found.parent == SCENARIOS else name_or_path

@@ -21,7 +21,7 @@ from pydantic_core import PydanticCustomError
 
 from salient import config
 from salient.config import OPTIONS, either
-from salient.errors import SHOWN_MAX, shown
+from salient.errors import SHOWN_MAX, close_names, shown
 
 TOML_BYTES_MAX = 1_000_000
 
@@ -125,17 +125,21 @@ def validate(model: type[_Model], data: object, section: str = "") -> _Model:
         raise TextFileError(_one_line(error, model, section)) from None
 
 
+def shown_key(name: str) -> str:
+    """A wrong key in a message, as it stands unless it is long or needs quotes."""
+    return name if re.fullmatch(r"\w+", name, re.ASCII) and len(name) <= SHOWN_MAX else shown(name)
+
+
 def _one_line(error: ValidationError, model: type[Table], section: str) -> str:
     """The first mistake; an unknown key before others, because a misspelt key is missing as well."""
     found = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
     place = [part for part in found["loc"] if isinstance(part, str)]
     *parents, last = [*([section] if section else []), *place] or [""]
-    is_plain = re.fullmatch(r"\w+", last, re.ASCII) and len(last) <= SHOWN_MAX
-    key = ".".join([*parents, last if is_plain else shown(last)])
+    key = ".".join([*parents, shown_key(last)])
     if found["type"] == "missing":
         return f"{key}: missing"
     if found["type"] == "extra_forbidden":
-        return f"{key}: unknown key; must be one of {', '.join(_keys(model, place[:-1]))}"
+        return f"{key}: unknown key; {close_names(last, _keys(model, place[:-1]))}"
     if found["type"] == "must_be":
         return f"{key}: {shown(found['input'])}: {found['msg']}"
     if found["type"] in ("model_type", "dict_type"):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import can
 from cantools.database.can import Database
 
 from salient.bus.signals import SignalTable
+from salient.errors import close_names
 
 
 class Client(Protocol):
@@ -42,20 +43,34 @@ class Client(Protocol):
 
 
 def unknown_attribute(name: str, known: Iterable[str]) -> AttributeError:
-    """The error for an attribute that does not exist; its text lists those that do."""
-    return AttributeError(f"no attribute '{name}'; there are {', '.join(sorted(known))}")
+    """The error for an attribute that does not exist; its text names the nearest."""
+    return AttributeError(f"no attribute '{name}'; {close_names(name, sorted(known))}")
 
 
 class KnownAttributes:
     """Base of classes to whose objects only properties and annotated attributes can be assigned.
 
-    AttributeError for any other name, so that a misspelt one does not pass unnoticed. Names with a leading underscore
-    are free.
+    AttributeError for any other name, so that a misspelt one does not pass unnoticed; it names the nearest, also where
+    an attribute is read. Names with a leading underscore are free.
     """
 
     def __setattr__(self, name: str, value: Any) -> None:
         cls = type(self)
-        annotated = {n for base in cls.__mro__ for n in vars(base).get("__annotations__", ()) if n[0] != "_"}
-        if not (name.startswith("_") or name in annotated or hasattr(getattr(cls, name, None), "__set__")):
-            raise unknown_attribute(name, annotated | {n for n in dir(cls) if not n.startswith("_")})
+        if not (name.startswith("_") or name in _annotated(cls) or hasattr(getattr(cls, name, None), "__set__")):
+            raise unknown_attribute(name, _public(cls))
         super().__setattr__(name, value)
+
+    if not TYPE_CHECKING:  # where it is seen, every attribute is taken to exist
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("_") or name in _public(type(self)):
+                return object.__getattribute__(self, name)  # an AttributeError within a property is its own
+            raise unknown_attribute(name, _public(type(self)))
+
+
+def _annotated(cls: type) -> set[str]:
+    return {n for base in cls.__mro__ for n in vars(base).get("__annotations__", ()) if n[0] != "_"}
+
+
+def _public(cls: type) -> set[str]:
+    return _annotated(cls) | {n for n in dir(cls) if not n.startswith("_")}

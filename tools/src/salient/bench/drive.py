@@ -17,7 +17,7 @@ from salient.bench.client import Client, KnownAttributes
 from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
-from salient.errors import RunFailed, UsageError
+from salient.errors import RunFailed, UsageError, close_names
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
@@ -323,9 +323,9 @@ class Parameters(MutableMapping[str, float]):
         return self._loaded
 
     def row(self, name: str) -> ParameterRow:
-        """Description of one parameter; KeyError lists the names."""
+        """Description of one parameter; KeyError names the nearest."""
         if name not in self.rows:
-            raise KeyError(f"no parameter '{name}'; the parameters are {', '.join(self.rows)}")
+            raise KeyError(f"no parameter '{name}'; {close_names(name, self.rows)}")
         return self.rows[name]
 
     def __getitem__(self, name: str) -> float:

@@ -24,7 +24,7 @@ from cantools.database.can import Signal
 
 from salient.bus.signals import rig_database, signal_range
 from salient.config import either
-from salient.errors import UsageError
+from salient.errors import UsageError, close_names
 from salient.paths import ROOT
 
 PAGE = ROOT / "emulator" / "FAULTS.md"
@@ -34,8 +34,8 @@ _MESSAGE = "RIG_FAULT"
 
 
 class FaultError(UsageError):
-    """A fault that does not exist, has not this place or attribute, or that the bench rejects; the text lists what
-    there is."""
+    """A fault that does not exist, has not this place or attribute, or that the bench rejects; the text names
+    the nearest kinds, or the places and the attribute that the kind has."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ def fault_kinds() -> dict[str, FaultKind]:
 
 
 def fault_kind(name: str) -> FaultKind:
-    """The kind of a name; FaultError lists the kinds."""
+    """The kind of a name; FaultError names the nearest."""
     kinds = fault_kinds()
     if name not in kinds:
-        raise FaultError(f"no fault '{name}'; there are {', '.join(sorted(kinds))}")
+        raise FaultError(f"no fault '{name}'; {close_names(name, sorted(kinds))}")
     return kinds[name]
 
 
@@ -148,8 +148,9 @@ _INTRODUCTION = """\
 `bench.fault(KIND, phase=..., leg=..., ATTRIBUTE=..., duration_s=...)`, `bench.at(TIME).fault(...)`, in a scenario a
 table `[[fault]]` with the same names and `at_s`; over CAN `RIG_FAULT`. Begin and end are exact to the microsecond of
 virtual time and stand in the CAN log as `RIG_TRUTH_FAULT`; up to 64 changes wait for their time. Faults of different
-kinds and places act together. An unknown kind, place or attribute is an error that lists what there is, and what the
-machine or the target cannot do is refused as `unsupported`. Physics: `plant/faulted.h`; sensors: `plant/sensors.h`.
+kinds and places act together. An unknown kind is an error that names the nearest three, an unknown place or attribute
+one that lists those of the kind, and what the machine or the target cannot do is refused as `unsupported`. Physics:
+`plant/faulted.h`; sensors: `plant/sensors.h`.
 
 | kind | places | attribute | range | meaning |
 | --- | --- | --- | --- | --- |

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from salient.bench.drive import ParameterRow, raw_value
 from salient.bench.session import SILENCE_MAX_S, Session
-from salient.errors import UsageError, shown
+from salient.errors import UsageError, close_names, shown
 from salient.toml_file import TextFileError, read_toml
 
 
@@ -109,7 +109,7 @@ def read(path: Path, rows: dict[str, ParameterRow]) -> dict[str, float]:
 
 def _mistake(name: str, value: object, rows: dict[str, ParameterRow]) -> str:
     if name not in rows:
-        return f"{shown(name)}: unknown parameter; the parameters are {', '.join(rows)}"
+        return f"{shown(name)}: unknown parameter; {close_names(name, rows)}"
     row = rows[name]
     allowed = f"{name}: {shown(value)}: must be a number from {_range(row)} {row.unit}".rstrip()
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

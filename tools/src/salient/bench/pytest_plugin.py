@@ -40,7 +40,7 @@ from salient.bench.bench import Bench
 from salient.bench.session import Session
 from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD
 from salient.errors import UsageError
-from salient.machine.cache import bench_config
+from salient.machine.cache import bench_config, check_options
 from salient.paths import COMMAND
 from salient.tab.link import link_of
 
@@ -202,6 +202,7 @@ def make_bench(request: pytest.FixtureRequest, tmp_path: Path, bench_choice: dic
     starts_emulator = _starts_emulator(request.node)
 
     def make(can: str | None = None, **options: Any) -> Any:
+        check_options(options)
         if not starts_emulator and can is None:
             session = DriveOnBus(bus, options.get("machine"), options.get("node", 0))
             state.benches.append(session)

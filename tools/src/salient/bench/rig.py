@@ -65,7 +65,7 @@ class Rig:
 
     rig.load_torque_Nm = 8 acts now, rig.at(0.13).load_torque_Nm = 8 at exactly 0.13 s of virtual time. RigError when
     the bench rejects the value: out of range, in the past, or more than 64 changes waiting. AttributeError, with the
-    list of the variables, when there is no such variable. rig.describe() lists them with unit, range and meaning.
+    nearest variables, when there is no such variable. rig.describe() lists them with unit, range and meaning.
     """
 
     __slots__ = ("_assigned", "_at_us", "_client")

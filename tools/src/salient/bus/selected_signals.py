@@ -10,7 +10,7 @@ import can
 import cantools
 from cantools.database.can import Database
 
-from salient.bus.signals import Signal, SignalTable
+from salient.bus.signals import Signal, SignalTable, near_signals
 from salient.errors import UsageError
 
 _DECIMALS_MAX = 4
@@ -79,15 +79,12 @@ def _columns(databases: Sequence[Database], names: Sequence[str]) -> list[_Colum
 
 def _resolve(name: str, known: Collection[str]) -> str:
     """The one of MESSAGE.SIGNAL that a name means."""
-    message, dot, _ = name.partition(".")
     found = [full_name for full_name in known if name in (full_name, full_name.partition(".")[2])]
     if len(found) == 1:
         return found[0]
     if found:
         raise UsageError(f"--signals {name}: in several messages: {', '.join(found)}")
-    of_message = [full_name for full_name in known if dot and full_name.startswith(f"{message}.")]
-    there = of_message or sorted({full_name.partition(".")[2] for full_name in known})
-    raise UsageError(f"--signals {name}: no such signal; there are {', '.join(there)}")
+    raise UsageError(f"--signals {name}: no such signal; {near_signals(name, known)}")
 
 
 def _number(definition: cantools.database.can.Signal, value: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 from cantools.database.can import Database, Message
 
 from salient.dbc import drive_dbc_of_node, rig_dbc_of_node
+from salient.errors import close_names
 from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
@@ -44,6 +45,20 @@ def drive_database(machine: str | None = None, node: int = 0) -> Database:
 def rig_database(node: int = 0) -> Database:
     """The DBC of the test bench of a drive with a node number."""
     return database_of(rig_dbc_of_node(RIG_DBC.read_text(encoding="ascii"), node))
+
+
+def near_signals(name: str, known: Iterable[str]) -> str:
+    """close_names of a signal: SIGNAL among the signals, MESSAGE.SIGNAL among those of the message, or all when there
+    is no such message. known: names of which those in the form MESSAGE.SIGNAL count."""
+    full = [each for each in known if "." in each]
+    message, dot, _ = name.partition(".")
+    of_message = [each for each in full if dot and each.startswith(f"{message}.")]
+    return close_names(name, of_message or (full if dot else sorted({each.partition(".")[2] for each in full})))
+
+
+def no_message(name: str, messages: Iterable[Message]) -> KeyError:
+    """The error for a message that a node does not send."""
+    return KeyError(f"no message '{name}'; {close_names(name, [message.name for message in messages])}")
 
 
 def value_numbers(database: Database, message: str, signal: str) -> dict[str, int]:
@@ -98,7 +113,7 @@ class SignalTable(Mapping[str, Signal]):
     signal has the frames that carry it.
 
     table["speed_rpm"] is the signal of that name in the message with the lowest identifier that has one;
-    table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError lists the signals.
+    table["DRIVE_FAULT_SNAPSHOT.speed_rpm"] names its message. KeyError names the nearest.
     """
 
     def __init__(self, database: Database, sender: str | None = None) -> None:
@@ -129,7 +144,7 @@ class SignalTable(Mapping[str, Signal]):
 
     def __getitem__(self, name: str) -> Signal:
         if name not in self._names:
-            raise KeyError(f"no signal '{name}'; the signals are {', '.join(n for n in self._names if '.' not in n)}")
+            raise KeyError(f"no signal '{name}'; {near_signals(name, self._names)}")
         key, signal = self._names[name]
         raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
         time_ns = np.array(self._times[key], dtype=np.int64)
@@ -150,7 +165,7 @@ class SignalTable(Mapping[str, Signal]):
         for key, message in self._messages.items():
             if message.name == message_name:
                 return len(self._times[key])
-        raise KeyError(f"no message '{message_name}'")
+        raise no_message(message_name, self._messages.values())
 
 
 def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:

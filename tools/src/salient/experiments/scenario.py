@@ -63,7 +63,7 @@ from salient.bench.rig import CHANGES_MAX, bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
-from salient.errors import UsageError
+from salient.errors import UsageError, close_names
 from salient.experiments.consistency import check_consistency
 from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
@@ -241,7 +241,7 @@ def _check_parameter_names(scenario: Scenario, config: BenchConfig) -> None:
     for name, value in scenario.parameters.items():
         row = rows.get(name)
         if row is None:
-            raise UsageError(f"parameters.{name}: unknown parameter; must be one of {', '.join(rows)}")
+            raise UsageError(f"parameters.{name}: unknown parameter; {close_names(name, rows)}")
         if not row.minimum <= value <= row.maximum:
             allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
             raise UsageError(f"parameters.{name}: {value:g}: must be a number from {allowed}")

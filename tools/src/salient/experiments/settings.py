@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from salient.bench.rig import bench_variables, variable_range
-from salient.errors import UsageError
+from salient.errors import UsageError, close_names
 from salient.experiments.scenario import Scenario
 from salient.machine.parameter_table import read_table
 
@@ -48,8 +48,8 @@ def check_name(name: str, text: str) -> None:
     """UsageError for a name that neither a parameter nor a variable of the bench has."""
     parameters = [row.name for row in read_table()]
     if name not in parameters and name not in bench_variables():
-        raise UsageError(f"--set {text}: {name}: must be a parameter of the drive ({', '.join(parameters)}) or a "
-                         f"variable of the test bench ({', '.join(bench_variables())})")
+        raise UsageError(f"--set {text}: {name}: neither a parameter of the drive nor a variable of the test "
+                         f"bench; {close_names(name, [*parameters, *bench_variables()])}")
 
 
 def with_setting(scenario: Scenario, name: str, value: float) -> Scenario:

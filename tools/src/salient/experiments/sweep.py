@@ -36,7 +36,7 @@ from salient.experiments.settings import parse_values, with_setting
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
-from salient.paths import SCENARIOS
+from salient.paths import scenario_path
 from salient.progress import Progress, steps_of
 
 TABLE, PLOT = "sweep.csv", "sweep.png"
@@ -88,8 +88,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 
 def runs_of(options: argparse.Namespace) -> list[Run]:
     """The combinations in order. UsageError for whatever no run could use."""
-    path = SCENARIOS / f"{options.scenario}.toml"
-    base = load_scenarios(path if path.is_file() else options.scenario)
+    base = load_scenarios(scenario_path(options.scenario))
     axes: dict[str, Sequence[Any]] = {
         "machine": options.machine or [base[0].machine],
         "controller": options.controller or [scenario.controller for scenario in base],

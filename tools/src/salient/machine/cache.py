@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from salient.config import DEFAULTS, BenchConfig
-from salient.errors import UsageError
+from salient.errors import UsageError, close_names
 from salient.machine.path import MachineError, machine_path, stated_conditions
 from salient.paths import BUILD, DRIVE_DBC, IS_WHEEL, PARAMETERS, PYTHON_PACKAGES
 
@@ -55,9 +55,17 @@ def _image(path: Path) -> Mapping[str, bytes]:
     return {IMAGE_SUFFIX: image_of(path)}
 
 
+def check_options(given: Iterable[str]) -> None:
+    """UsageError for a name that no option of a bench has."""
+    for name in given:
+        if name not in DEFAULTS:
+            raise UsageError(f"bench option '{name}': no such option; {close_names(name, DEFAULTS)}")
+
+
 def bench_config(given: Mapping[str, Any]) -> BenchConfig:
     """The options of a bench: those given, control rate and sensors that [drive] of the machine file states otherwise,
-    else the defaults. UsageError: as machine_image."""
+    else the defaults. UsageError: no such option; as machine_image."""
+    check_options(given)
     machine = given.get("machine", DEFAULTS["machine"])
     image = given.get("machine_image") or machine_image(machine)  # checks the file
     return BenchConfig(**{**stated_conditions(machine_path(machine)), **given, "machine_image": image})

@@ -6,14 +6,13 @@ The meaning of the keys: emulator/plant/machine.h.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
-from salient.errors import shown
+from salient.errors import close_names, shown
 from salient.machine.definition import Machine, MachineError
 from salient.machine.drive_data import check
 from salient.machine.flux_map import FluxMap, FluxMapError
@@ -21,7 +20,7 @@ from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
 from salient.machine.parameter_table import SAME_UNITS, read_table
 from salient.machine.path import machine_path
-from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, validate
+from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown_key, validate
 
 __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
            "machine_path"]
@@ -219,9 +218,8 @@ def _parameters(table: dict[str, Any]) -> dict[str, float]:
     for name, value in table.items():
         row = rows.get(name)
         if row is None:
-            key = name if name.isidentifier() and name.isascii() and len(name) < 60 else shown(name)
-            near = "".join(f"; the nearest is {match}" for match in difflib.get_close_matches(name[:60], rows, 1))
-            raise TextFileError(f"drive.parameters.{key}: unknown key{near}; all are in firmware/PARAMETERS.md")
+            raise TextFileError(f"drive.parameters.{shown_key(name)}: unknown key; {close_names(name, rows)}; "
+                                "all are in firmware/PARAMETERS.md")
         low, high = row.limits if row.unit in SAME_UNITS else (0.0, 1e6)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not low <= value <= high or (row.fraction_bits == 0 and value != int(value)):
@@ -231,6 +229,10 @@ def _parameters(table: dict[str, Any]) -> dict[str, float]:
 
 
 def _magnetics(path: Path, table: dict[str, Any], rotor_poles: int) -> Formula | FluxMap:
+    keys_of_all = [name for model in MAGNETICS.values() for name in model.model_fields]
+    for name in table if "form" not in table else ():  # the misspelt form, or a key of no form
+        if name not in keys_of_all:
+            raise TextFileError(f"magnetics.{shown_key(name)}: unknown key; {close_names(name, keys_of_all)}")
     form = table.get("form")
     if not isinstance(form, str) or form not in MAGNETICS:
         raise TextFileError(f"magnetics.form: {shown(form)}: must be one of {', '.join(FORMS)}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from salient.experiments.scenario import RunResult, check_parameters, load_scenarios, write_summaries
-from salient.paths import make_folder
+from salient.paths import make_folder, scenario_path
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, PROCESSOR_HZ, estimable, fits
 from salient.target.isr_profile import IsrProfile, measure_run
 from salient.target.pil_report import write_pil_report
@@ -87,7 +87,7 @@ def summary(profiles: Mapping[str, IsrProfile], target: str) -> str:
 
 
 def _run_scenario(path: Path, out: Path, target: str) -> int:
-    scenarios = load_scenarios(path)
+    scenarios = load_scenarios(scenario_path(path))
     check_parameters(scenarios, target)
     make_folder(out)
     results: dict[str, RunResult] = {}

@@ -16,7 +16,7 @@ from cantools.database.can import Database
 from salient.bench.drive import Drive, DriveError, OtherDatabase
 from salient.bench.rig import Rig, RigError
 from salient.bus.clock import VirtualTimeReader, open_bus
-from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.bus.signals import SignalTable, drive_database, no_message, rig_database
 from salient.dbc import database_hash
 from salient.view.frames import Chunk, FrameStore
 
@@ -57,7 +57,7 @@ class LatestSignals(SignalTable):
         for key, message in self._messages.items():
             if message.name == message_name:
                 return self._counts[key]
-        raise KeyError(f"no message '{message_name}'")
+        raise no_message(message_name, self._messages.values())
 
 
 class DriveTime:

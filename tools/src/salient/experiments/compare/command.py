@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from salient.config import DEFAULTS
-from salient.errors import UsageError
+from salient.errors import UsageError, close_names
 from salient.experiments.compare import baseline, results_file, summary_file, table
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
 def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
     for name in groups:
         if name not in GROUPS:
-            raise UsageError(f"unknown group {name}: must be one of {', '.join(GROUPS)}")
+            raise UsageError(f"unknown group {name}: {close_names(name, GROUPS)} (--list)")
     return [case for name, group in GROUPS.items() if name in groups or (not groups and not group.long)
             for case in group.cases(quick)]
 
