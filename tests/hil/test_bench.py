@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -80,6 +81,29 @@ def test_run_until_stops_at_the_condition_or_the_timeout(bench):
     assert 0.01 < reached_s == bench.time_s < 0.05
     with pytest.raises(AssertionError, match="within 0.01 s, at .* s of virtual time"):
         bench.run_until(lambda: False, timeout=0.01)
+
+
+@pytest.mark.parametrize("duration_s", [-1, -1e-8, float("nan"), float("inf"), "1", None, True])
+def test_time_that_cannot_pass_is_refused(bench, duration_s):
+    for run, name in ((bench.run_for, "run_for: duration_s"), (bench.leave_running, "leave_running: duration_s"),
+                      (lambda value: bench.run_until(lambda: True, timeout=value), "run_until: timeout"),
+                      (lambda value: bench.run_until(lambda: False, timeout=0.01, step_s=value), "run_until: step_s")):
+        with pytest.raises(UsageError, match=f"^{name} {re.escape(repr(duration_s))}: must be a number of seconds"):
+            run(duration_s)
+    assert bench.time_ns == 0
+
+
+def test_step_of_no_time_is_refused(bench):
+    with pytest.raises(UsageError, match="^run_until: step_s 0: must be a number of seconds from 1e-09"):
+        bench.run_until(lambda: False, timeout=0.01, step_s=0)
+
+
+def test_value_instead_of_a_condition_is_refused(bench):
+    bench.run_for(0.005)
+    with pytest.raises(UsageError, match=r"^run_until: condition (np\.)?False_?: must be a function"):
+        bench.run_until(bench.truth["speed_rpm"].last > 150, timeout=0.1)
+    with pytest.raises(UsageError, match="^run_until: condition 'speed_rpm > 150': must be a function"):
+        bench.run_until("speed_rpm > 150", timeout=0.1)
 
 
 def test_commands_are_sent_cyclically_until_silence(bench):

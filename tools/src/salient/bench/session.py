@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import sys
 from collections.abc import Callable
 from typing import Any, Self
@@ -23,7 +24,7 @@ from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
-from salient.errors import RunFailed
+from salient.errors import RunFailed, UsageError, shown
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
 SILENCE_MAX_S = 5.0
@@ -39,6 +40,18 @@ _NO_STEP_NS = 1 << 62
 
 _IDENTITY_WAIT_NS = 250_000_000
 """More than two periods of DRIVE_IDENTITY."""
+
+
+_TIME_MAX_S = 280_000.0
+"""A time of RIG_RUN_UNTIL has 6 bytes: 281,474 s."""
+
+
+def _nanoseconds(name: str, time_s: float, least_s: float = 0.0) -> int:
+    """A time in ns; UsageError below least_s. A negative one would pass no time, and a step of 0 would never end."""
+    is_number = isinstance(time_s, numbers.Real) and not isinstance(time_s, bool)
+    if not is_number or not least_s <= time_s <= _TIME_MAX_S:
+        raise UsageError(f"{name} {shown(time_s)}: must be a number of seconds from {least_s:g} to {_TIME_MAX_S:g}")
+    return round(time_s * 1e9)
 
 
 class SessionError(RunFailed):
@@ -140,8 +153,9 @@ class Session(KnownAttributes):
         self._bus.shutdown()
 
     def leave_running(self, duration_s: float) -> None:
-        """Leaves the bus after a request to run on for duration_s of virtual time; lock-step only."""
-        self._request_run(self.time_ns + round(duration_s * 1e9))
+        """Leaves the bus after a request to run on for duration_s of virtual time; lock-step only. UsageError when
+        duration_s is negative or no number."""
+        self._request_run(self.time_ns + _nanoseconds("leave_running: duration_s", duration_s))
         self.close()
 
     def __enter__(self) -> Self:
@@ -186,22 +200,30 @@ class Session(KnownAttributes):
         self.rig.clear_fault(kind, **places)
 
     def run_for(self, duration_s: float) -> None:
-        """Lets virtual time pass; commands go out as they fall due."""
-        self.advance_to(self.time_ns + round(duration_s * 1e9))
+        """Lets virtual time pass; commands go out as they fall due.
+
+        UsageError when duration_s is negative or no number.
+        """
+        self.advance_to(self.time_ns + _nanoseconds("run_for: duration_s", duration_s))
 
     def run_until(self, condition: Callable[[], bool], timeout: float, step_s: float = 1e-3) -> float:
         """Lets virtual time pass in steps until the condition holds; returns the time in seconds.
 
-        AssertionError when it does not hold within `timeout` seconds of virtual time.
+        AssertionError when it does not hold within `timeout` seconds of virtual time. UsageError when the condition is
+        no function, and when timeout or step_s is negative or no number, or step_s 0.
         """
-        deadline_ns = self.time_ns + round(timeout * 1e9)
+        if not callable(condition):
+            raise UsageError(f"run_until: condition {shown(condition)}: must be a function, called at every step,"
+                             " as in run_until(lambda: ..., timeout=1.0); a value was computed once, before the call")
+        deadline_ns = self.time_ns + _nanoseconds("run_until: timeout", timeout)
+        step_ns = _nanoseconds("run_until: step_s", step_s, least_s=1e-9)
         while not condition():
             if self.time_ns >= deadline_ns:
                 held = self.drive.start_inhibited_by
                 reason = "" if held in ("none", "unknown") else f"; the drive is not ready: its check {held} fails"
                 raise AssertionError(f"condition not met within {timeout:g} s, at {self.time_s:g} s of virtual time"
                                      f"{reason}")
-            self.advance_to(min(deadline_ns, self.time_ns + round(step_s * 1e9)))
+            self.advance_to(min(deadline_ns, self.time_ns + step_ns))
         return self.time_s
 
     def advance_to(self, time_ns: int) -> None:
