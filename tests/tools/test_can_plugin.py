@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import subprocess
 import sys
+import time
 
 import can
 import pytest
@@ -114,6 +116,74 @@ def test_end_of_the_drive_is_reported(connect):
             bus.recv(TIMEOUT_S)
     with pytest.raises(can.CanOperationError, match="can0.sock: the drive has ended"):
         bus.send(can.Message(arbitration_id=1))
+
+
+class CountingListener(can.Listener):
+    """Handles errors, so that a Notifier goes on."""
+
+    def __init__(self) -> None:
+        self.errors: list[Exception] = []
+
+    def on_message_received(self, msg: can.Message) -> None:
+        pass
+
+    def on_error(self, exc: Exception) -> None:
+        self.errors.append(exc)
+
+
+@pytest.mark.parametrize("cause", ["drive", "client"])
+def test_listener_that_handles_the_end_is_not_called_without_pause(connect, cause):
+    """One call, and one more per timeout of the Notifier: 1 s."""
+    bus, listener = connect(), CountingListener()
+    with can.Notifier(bus, [listener]):
+        if cause == "drive":
+            connect.bench.simulator.close()
+        else:
+            bus.shutdown()
+        time.sleep(1.5)
+    assert 1 <= len(listener.errors) <= 3
+    reason = {"drive": "the drive has ended", "client": "this client was shut down"}[cause]
+    assert all(str(error).endswith(reason) for error in listener.errors)
+
+
+def test_event_loop_reports_the_end_once(connect):
+    bus = connect()
+    reported = []
+
+    async def wait_for_the_end() -> None:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: reported.append(context["exception"]))
+        with can.Notifier(bus, [can.AsyncBufferedReader()], loop=loop):
+            connect.bench.simulator.close()
+            await asyncio.sleep(0.5)
+
+    asyncio.run(wait_for_the_end())
+    assert [str(error).endswith("can0.sock: the drive has ended") for error in reported] == [True]
+
+
+def test_frames_ahead_of_the_end_are_received(tmp_path):
+    """A server that ends with a frame of this client unread: the system reports a reset ahead of what was delivered."""
+    path = f"{tmp_path}/can.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        server.bind(path)
+        server.listen()
+        with SalientBus(f"unix:{path}") as bus:
+            served, _ = server.accept()
+            bus.send(FRAMES[0])
+            for _ in range(3):
+                served.send(bytes(8) + frame_bytes(FRAMES[1]))
+            served.close()
+            assert [bus.recv(TIMEOUT_S).arbitration_id for _ in range(3)] == [0x7FF] * 3
+            with pytest.raises(can.CanOperationError, match="the drive has ended"):
+                bus.recv(TIMEOUT_S)
+
+
+def test_flush_leaves_what_was_sent_on_its_way(connect):
+    sender, listener = connect(), connect()
+    sender.send(FRAMES[1])
+    sender.flush_tx_buffer()
+    connect.bench.run_for(0.001)
+    assert received(listener, FRAMES[1]).data == FRAMES[1].data
 
 
 def test_absent_drive_is_reported(tmp_path):

@@ -9,6 +9,7 @@ every frame to every client, its sender included, when it has completed on the e
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
@@ -41,6 +42,8 @@ _ECHOES_MAX = 4096
 _SO_RCVBUFFORCE = 33  # missing in Python's socket module
 _READY_POLL_S = 0.05
 _CLOSE_TIMEOUT_S = 1.0
+_REPEAT_S = 1.0
+"""Between two reports of the end to one who receives without a timeout."""
 
 
 class VirtualMessage(can.Message):
@@ -167,7 +170,8 @@ class SalientBus(can.BusABC):
 
     channel: "unix:PATH" (or PATH). receive_own_messages: also receive the frames that this client sent, once they have
     completed on the emulated bus. Flexible data rate, remote and error frames pass. When the emulator ends, send and
-    recv raise can.CanOperationError that names the channel.
+    recv raise can.CanOperationError that names the channel; a second recv only after its timeout (1 s without one), as
+    can.Notifier calls recv for as long as a listener handles the error. fileno is then never ready again.
     """
 
     def __init__(self, channel: str, can_filters: CanFilters | None = None,
@@ -180,6 +184,7 @@ class SalientBus(can.BusABC):
         # Frames sent whose echo is outstanding. The order is kept within each queue, not between the two.
         self._sent_on_bus: deque[bytes] = deque(maxlen=_ECHOES_MAX)
         self._sent_immediate: deque[bytes] = deque(maxlen=_ECHOES_MAX)
+        self._has_ended = False
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             _enlarge_receive_buffer(self._socket)
@@ -220,10 +225,12 @@ class SalientBus(can.BusABC):
                 if not select.select([self._socket], [], [], timeout)[0]:
                     return None, False
                 continue
+            except ConnectionResetError:
+                continue  # comes once, ahead of the frames that are left
             except OSError as error:
-                raise self._gone() from error
+                raise self._end(timeout) from error
             if not record:
-                raise self._gone()
+                raise self._end(timeout)
             frame = record[_TIME.size :]
             if (self._sent_on_bus or self._sent_immediate) and self._is_own_echo(frame):
                 continue
@@ -240,8 +247,25 @@ class SalientBus(can.BusABC):
                 return True
         return False
 
+    def _end(self, timeout: float | None) -> can.CanOperationError:
+        """What recv raises when nothing is left to receive."""
+        if self._has_ended or self._is_shutdown:
+            time.sleep(_REPEAT_S if timeout is None else max(0.0, timeout))
+        else:
+            self._has_ended = True
+            # The end of a connection is always ready to be read: an event loop would call back without a pause.
+            silent = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+            os.dup2(silent, self._socket.fileno(), inheritable=False)
+            os.close(silent)
+        return self._gone()
+
     def _gone(self) -> can.CanOperationError:
-        return can.CanOperationError(f"unix:{self._path}: the drive has ended")
+        reason = "this client was shut down" if self._is_shutdown else "the drive has ended"
+        return can.CanOperationError(f"unix:{self._path}: {reason}")
+
+    def flush_tx_buffer(self) -> None:
+        """Without effect: a client has no queue. A frame is with the emulator when send returns, and goes onto the bus.
+        """
 
     def fileno(self) -> int:
         """For select, asyncio and can.Notifier."""
