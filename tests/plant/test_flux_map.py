@@ -375,6 +375,11 @@ REJECTED = {
     "a step in the current": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda _, current, flux: 0.2 * (current > 51) + 1e-9 * current + (
             1e-4 * flux)),
+        ["gives without saturation", "5% of the map's largest", "inductance of line 2,", "line "],
+    ),
+    "no rise in the current": (
+        sampled_file(REGULAR_DEG, REGULAR_A, lambda _, current, flux: 0.2 * (current > 0) + 1e-9 * current + (
+            1e-4 * flux)),
         ["incremental inductance", "uneven", "line "],
     ),
 }

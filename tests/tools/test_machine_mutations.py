@@ -299,6 +299,51 @@ def test_every_mutation_of_a_key_or_table_is_rejected_by_one_line_that_names_it(
     assert not wrong, wrong
 
 
+@pytest.mark.parametrize(("aligned_H", "flux_Wb", "current_A", "most"), [
+    ("110e-3", "3.0", "25.0", "2.75 Wb"),
+    ("110e-3", "75.0", "25.0", "2.75 Wb"),
+    ("23.6e-3", "10.7", "450.0", "10.62 Wb"),
+    ("23.6e-3", "0.486", "20.0", "0.472 Wb"),
+])
+def test_flux_linkage_above_what_the_inductance_gives_names_both_keys(tmp_path, aligned_H, flux_Wb, current_A, most):
+    keys = {"aligned_inductance_H": aligned_H, "flux_linkage_max_Wb": flux_Wb,
+            "current_at_flux_linkage_max_A": current_A}
+    text = rejection(write(tmp_path, toml({**GOOD_TABLES, "magnetics": {**GOOD_TABLES["magnetics"], **keys}})))
+    assert text == (
+        f"magnetics.flux_linkage_max_Wb: {float(flux_Wb):g} Wb: must not be above {most}, which aligned_inductance_H, "
+        f"{float(aligned_H):g} H, gives without saturation at current_at_flux_linkage_max_A, {float(current_A):g} A")
+
+
+def test_flux_linkage_without_saturation_is_a_machine(tmp_path):
+    keys = {"flux_linkage_max_Wb": "0.472", "current_at_flux_linkage_max_A": "20.0"}  # 23.6 mH times 20 A
+    assert rejection(write(tmp_path, toml({**GOOD_TABLES, "drive": {}, "drive.parameters": {},
+                                           "magnetics": {**GOOD_TABLES["magnetics"], **keys}}))) is None
+
+
+@pytest.mark.parametrize("factor", [1.1, 50.0])
+def test_map_point_above_what_lower_currents_give_names_both_lines(tmp_path, factor):
+    """The flux linkage at the last current and the aligned position, as a multiple of that without saturation."""
+    rows = list(ROWS)
+    first_Wb = float(ROWS[0].split(",")[2])
+    most_Wb = first_Wb / 8.0 * 80.0
+    last_Wb = f"{factor * most_Wb:.6g}"
+    rows[9] = f"0,80,{last_Wb}"
+    text = rejection(write(tmp_path, MAP_MACHINE, csv(rows)))
+    assert text == (
+        f"line 11: at 0 deg the flux linkage is {float(last_Wb):.4g} Wb at 80 A; must not be above {most_Wb:.4g} Wb, "
+        f"which the inductance of line 2, {first_Wb / 8.0:.4g} H at 8 A, gives without saturation, but for 5% of the "
+        "map's largest")
+
+
+@pytest.mark.parametrize("rise", [0.9, 0.95, 1.0])
+def test_map_with_low_permeability_in_weak_fields_is_a_machine(tmp_path, rise):
+    """At the lowest current the inductance of iron is lower than where its permeability is highest."""
+    rows = [row.split(",") for row in ROWS]
+    for row in rows[::len(CURRENTS_A)]:
+        row[2] = f"{rise * float(row[2]):.6g}"
+    assert rejection(write(tmp_path, MAP_MACHINE, csv([",".join(row) for row in rows]))) is None
+
+
 def drive(**keys: str) -> str:
     """A machine file whose [drive] has nothing but these keys; one with a point in its name is of [drive.parameters]
     ("parameters.smc_k")."""

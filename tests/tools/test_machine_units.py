@@ -81,6 +81,9 @@ def test_no_derived_default_is_beyond_the_range_of_its_parameter(name):
     ("friction_Nm_s = 0.5", "friction_Nm_s = 200.0", r"mechanics\.friction_Nm_s: 200: must be a number from 0 to 121"),
     ("torque_peak_Nm = 2000.0", "torque_peak_Nm = 2000.0\n[drive.parameters]\ntorque_max_Nm = 7000.0",
      r"drive\.parameters\.torque_max_Nm: 7000: must be a number from 0 to 6400, "),
+    ("inertia_kg_m2 = 4.0", "inertia_kg_m2 = 200.0",
+     r"mechanics\.inertia_kg_m2: 200: .*: they follow from drive\.torque_peak_Nm, 2000 N m and "
+     r"magnetics\.flux_linkage_max_Wb, 1\.\d+ Wb aligned at 1\.5e\+03 A"),
 ])
 def test_machine_that_its_units_do_not_fit_is_refused_in_one_line(tmp_path, old, new, text):
     file = tmp_path / "refused.toml"

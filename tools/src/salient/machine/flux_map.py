@@ -43,6 +43,7 @@ CURRENT_LIMITS = (0.25, 2.0)
 MIRROR_TOLERANCE = 0.02  # between the halves of a whole pitch, of the map's greatest flux linkage
 FALL_TOLERANCE = 0.01  # rise away from the aligned position, of the aligned flux linkage at the same current
 MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest flux linkage
+RISE_TOLERANCE = 0.05  # above the inductance at lower currents, of the map's greatest flux linkage
 REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of that of the others
 
 # Below it, time constants of the winding would make the emulator's steps as small as no machine needs them.
@@ -156,6 +157,7 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     curves contradict each other or the symmetry of the machine, or are too uneven for the model."""
     half_rad = math.pi / rotor_poles
     whole = curves[-1].angle_rad > 1.5 * half_rad
+    _check_inductance(curves)
     current_max_A = _common_current_A(curves)
     current_A = np.linspace(0.0, current_max_A, CURRENT_INTERVALS + 1)
     flux_Wb = np.array([_read_curve(curve, current_A) for curve in curves])
@@ -175,6 +177,25 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     model = FluxMap(rotor_poles, current_max_A, _integral(flux_coefficients, current_A[1]), file)
     _check_model(model, curves)
     return model
+
+
+def _check_inductance(curves: Sequence[Curve]) -> None:
+    """Saturation lowers the inductance: no flux linkage is above a straight line from 0 through one at a lower current.
+    The tolerance leaves room for the low permeability of iron in weak fields, and for noise."""
+    allowed_Wb = RISE_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
+    for curve in curves:
+        inductance_H = curve.flux_linkage_Wb / curve.current_A
+        most_Wb = np.maximum.accumulate(inductance_H)[:-1] * curve.current_A[1:]
+        at = 1 + int(np.argmax(curve.flux_linkage_Wb[1:] - most_Wb))
+        if curve.flux_linkage_Wb[at] > most_Wb[at - 1] + allowed_Wb:
+            lower = int(np.argmax(inductance_H[:at]))
+            raise FluxMapError(
+                f"line {curve.lines[at]}: at {_degrees(curve.angle_rad)} deg the flux linkage is"
+                f" {curve.flux_linkage_Wb[at]:.4g} Wb at {curve.current_A[at]:g} A; must not be above"
+                f" {most_Wb[at - 1]:.4g} Wb, which the inductance of line {curve.lines[lower]},"
+                f" {inductance_H[lower]:.4g} H at {curve.current_A[lower]:g} A, gives without saturation, but for"
+                f" {RISE_TOLERANCE:.0%} of the map's largest"
+            )
 
 
 def _common_current_A(curves: Sequence[Curve]) -> float:
