@@ -123,6 +123,51 @@ def test_drive_stopped_before_the_requested_duration_is_reported(listen):
                                    " passed: the drive was stopped\n", 1)
 
 
+def test_node_without_a_drive_is_told_once_with_the_nodes_that_are_heard(listen):
+    process = listen("monitor", "--node", "2", "--duration-s", "1.5", activity="monitoring")
+    listen.bench.run_for(1.2)
+    line = f"salient: {listen.bench.address}: no frame of a drive with node number 2 (--node), but of node 0"
+    assert process.stderr.readline() == f"{line}; listening on\n"
+    listen.bench.run_for(0.5)
+    assert finish(process) == ("", "", 1)
+
+
+@pytest.mark.parametrize("end", ["duration", "interrupt", "bus"])
+def test_node_that_was_never_heard_is_exit_code_1(listen, end):
+    process = listen("monitor", "--node", "2", "--signals", "DRIVE_STATUS.state", "--duration-s", "0.2",
+                     activity="monitoring")
+    listen.bench.run_for(0.15)
+    text = f"salient: {listen.bench.address}: no frame of a drive with node number 2 (--node), but of node 0\n"
+    if end == "duration":
+        listen.bench.run_for(0.1)
+    elif end == "interrupt":
+        assert process.stdout.readline()  # frames have come
+        process.send_signal(signal.SIGINT)
+    else:
+        listen.bench.simulator.close()
+        text = f"salient: {listen.bench.address}: the drive's bus closed before --duration-s 0.2 had passed: " \
+               f"the drive was stopped\n{text}"
+    assert finish(process)[1:] == (text, 1)
+
+
+def test_drive_that_comes_later_is_present():
+    heard = monitor._Nodes("unix:x", 1)
+    frame = can.Message(arbitration_id=0x080, is_extended_id=False, data=bytes(8))
+    ids = {node: next(key for key, value in clock.nodes_of_drives().items() if value == node) for node in (0, 1)}
+    for node, time_s in ((0, 0.0), (0, 1.1), (1, 1.2)):
+        frame.arbitration_id = ids[node]
+        heard.add(round(time_s * 1e9), frame)
+        assert heard.absent == (node == 0)
+
+
+def test_mf4_file_of_a_node_without_a_drive_is_exit_code_1(listen, tmp_path):
+    path = tmp_path / "log.mf4"
+    process = listen("log", "--node", "2", "--out", path, "--duration-s", "0.02", activity="recording")
+    listen.bench.run_for(0.05)
+    text = f"salient: {listen.bench.address}: no frame of a drive with node number 2 (--node), but of node 0\n"
+    assert finish(process)[1:] == (text, 1)
+
+
 class UnpluggedBus:
     """A SocketCAN interface that goes away after a frame."""
 
@@ -142,6 +187,23 @@ class UnpluggedBus:
 
     def __exit__(self, *exception):
         pass
+
+
+def test_interface_without_any_drive_is_told(salient_without_build, monkeypatch):
+    class SilentBus(UnpluggedBus):
+        """An interface without a frame, until it goes away."""
+
+        def __init__(self, address):
+            super().__init__(address)
+            self.frames = [None] * 3
+
+    monkeypatch.setattr(monitor, "open_bus", SilentBus)
+    monkeypatch.setattr(monitor.signal, "signal", lambda *_: None)
+    done = salient_without_build("monitor", "--can", "socketcan:can0")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[0] == ("salient: socketcan:can0: no frame of a drive with node number 0 (--node) or "
+                                           "of any other drive; listening on")
+    assert len(done.stderr.splitlines()) == 2
 
 
 @pytest.mark.parametrize(("command", "early"), [("log", ""), ("monitor", " before --duration-s 10 had passed")])

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import cast
 
@@ -30,10 +31,15 @@ _SUBJECTS = value_numbers(rig_database(), "RIG_STAMP", "subject")
 
 
 @lru_cache
-def _sent_by_drives() -> frozenset[int]:
-    """The identifiers that drives of any node number transmit."""
-    return frozenset(message.frame_id + NODE_STEP * node for message in drive_database().messages
-                     if "DRIVE" in message.senders for node in range(NODE_MAX + 1))
+def nodes_of_drives() -> Mapping[int, int]:
+    """The node number of a drive by the identifiers that it transmits."""
+    return {message.frame_id + NODE_STEP * node: node for message in drive_database().messages
+            if "DRIVE" in message.senders for node in range(NODE_MAX + 1)}
+
+
+def has_plain_data(message: can.Message) -> bool:
+    """Whether a frame is of the kind that drives and rigs transmit."""
+    return not (message.is_fd or message.is_error_frame or message.is_remote_frame)
 
 
 @lru_cache
@@ -64,7 +70,7 @@ class VirtualTimeReader:
         self._bus = bus
         # On SocketCAN a client that sends one of these between a stamp and its frame would take the frame's time; a bus
         # with two senders of one identifier is broken anyway.
-        self._drive_sends, self._rig_sends = _sent_by_drives(), _sent_by_rigs()
+        self._drive_sends, self._rig_sends = nodes_of_drives(), _sent_by_rigs()
         self._on_interface = not hasattr(bus, "receive_own_messages")  # SocketCAN
         self._unstamped = 0  # frames of the emulator before the first stamp
         self._stamped = False
@@ -123,7 +129,7 @@ class VirtualTimeReader:
         return None
 
     def _is_emulators(self, message: can.Message) -> bool:
-        if message.is_fd or message.is_error_frame or message.is_remote_frame:
+        if not has_plain_data(message):
             return False
         return message.arbitration_id in (self._rig_sends if message.is_extended_id else self._drive_sends)
 

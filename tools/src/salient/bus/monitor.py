@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import can
 from cantools.database.can import Database
 
-from salient.bus.clock import VirtualTimeReader, open_bus
+from salient.bus.clock import VirtualTimeReader, has_plain_data, nodes_of_drives, open_bus
 from salient.bus.interface import closed_in_order
 from salient.bus.log import open_log
 from salient.bus.selected_signals import SelectedSignals
@@ -32,6 +32,9 @@ _COLUMNS = (
 """Title, signal and number format, in the order of a line."""
 _WIDTH = 120
 """Characters of a line where the output is no terminal."""
+_ABSENT_S = 1.0
+"""Without a frame of a drive, whose heartbeat comes every 100 ms, until that is told: virtual time, and where no frame
+moves it, as on an interface without any drive, wall time."""
 
 
 class _BusClosed(Exception):
@@ -43,7 +46,8 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
     has.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
-    every case. Returns the exit code: 1 when the bus closed early (see _report_closed), else 0.
+    every case. Returns the exit code: 1 when the bus closed early (see _report_closed) or an MF4 file has no frame of
+    the drive, else 0.
     """
     open_bus(address).shutdown()  # fails before a file is created when there is no such bus
     try:
@@ -52,8 +56,10 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
         raise UsageError(f"--out {path}: {error.strerror}") from None
     log = open_log(path, machine, node)
     count, closed = 0, None
+    nodes = _Nodes(address, node if path.suffix == ".mf4" else None)  # the other formats have the frames of all
     try:
-        for timed in _frames(address, duration_s, "recording"):
+        for timed in _frames(address, duration_s, "recording", nodes.tell_absence):
+            nodes.add(*timed)
             log.write(*timed)
             count += 1
     except KeyboardInterrupt:
@@ -63,13 +69,14 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
     finally:
         log.close()
     print(f"{count} frames: {path}", flush=True)
-    return 0 if closed is None else _report_closed(address, duration_s, closed)
+    return _finish(address, duration_s, closed, nodes)
 
 
 def monitor(address: str, every_s: float, duration_s: float | None, machine: str,
             signals: Sequence[str] | None = None, node: int = 0) -> int:
     """Prints the named signals, else the main ones of the drive of a machine and node number, every `every_s` of
-    virtual time; ends as `record` does, with its exit code. UsageError: no such machine, or no signal of a name."""
+    virtual time; ends as `record` does, with its exit code, which is 1 as well when no frame of the drive has come.
+    UsageError: no such machine, or no signal of a name."""
     try:
         database = drive_database(machine, node)
     except MachineError as error:
@@ -78,9 +85,11 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
     if signals:
         width = shutil.get_terminal_size((_WIDTH, 1)).columns
         shown = SelectedSignals((database, rig_database(node)), signals, width)
-    due_ns = None
+    due_ns, closed = None, None
+    nodes = _Nodes(address, node)
     try:
-        for time_ns, message in _frames(address, duration_s, "monitoring"):
+        for time_ns, message in _frames(address, duration_s, "monitoring", nodes.tell_absence):
+            nodes.add(time_ns, message)
             shown.add(time_ns, message)
             due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
             if time_ns < due_ns:
@@ -91,13 +100,61 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
                 sys.stdout.flush()
             due_ns += round(every_s * 1e9)
     except _BusClosed as end:
-        return _report_closed(address, duration_s, str(end))
-    return 0
+        closed = str(end)
+    return _finish(address, duration_s, closed, nodes)
 
 
-def _frames(address: str, duration_s: float | None, activity: str) -> Iterator[tuple[int, can.Message]]:
-    """Frames until `duration_s` of virtual time have passed or an interrupt; _BusClosed when the bus closes first."""
+class _Nodes:
+    """The drives that are heard on a bus, and one line when the one of a node number is not."""
+
+    def __init__(self, address: str, wanted: int | None) -> None:
+        """wanted: its node number; None when none in particular is listened to."""
+        self._address = address
+        self._wanted = wanted
+        self._heard: set[int] = set()
+        self._from_ns: int | None = None
+        self._told = False
+
+    @property
+    def absent(self) -> bool:
+        """Whether no frame of the drive has come."""
+        return self._wanted is not None and self._wanted not in self._heard
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        """Takes a frame; tells when the drive has been absent for _ABSENT_S since the first one."""
+        if not self.absent:
+            return
+        node = None if message.is_extended_id or not has_plain_data(message) else nodes_of_drives().get(
+            message.arbitration_id)
+        if node is not None:
+            self._heard.add(node)
+        self._from_ns = time_ns if self._from_ns is None else self._from_ns
+        if time_ns - self._from_ns > _ABSENT_S * 1e9:
+            self.tell_absence("; listening on")
+
+    def tell_absence(self, end: str = "; listening on") -> None:
+        """One line, once, when the drive is absent."""
+        if self.absent and not self._told:
+            heard = " and ".join(map(str, sorted(self._heard)))
+            others = f", but of node {heard}" if heard else " or of any other drive"
+            print(f"salient: {self._address}: no frame of a drive with node number {self._wanted} (--node){others}"
+                  f"{end}", file=sys.stderr, flush=True)
+            self._told = True
+
+
+def _finish(address: str, duration_s: float | None, closed: str | None, nodes: _Nodes) -> int:
+    """The exit code, after a line for a bus that closed and for a drive that was not heard."""
+    code = 0 if closed is None else _report_closed(address, duration_s, closed)
+    nodes.tell_absence("")
+    return 1 if nodes.absent else code
+
+
+def _frames(address: str, duration_s: float | None, activity: str, tell_silence: Callable[[], None]
+            ) -> Iterator[tuple[int, can.Message]]:
+    """Frames until `duration_s` of virtual time have passed or an interrupt; _BusClosed when the bus closes first.
+    tell_silence is called where an interface has been silent for _ABSENT_S; the time of a local bus may stand still."""
     end_ns = None
+    timeout_s = None if address.startswith("unix:") else _ABSENT_S
     # A termination request ends the command like an interrupt, so that its output is complete.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with open_bus(address) as bus:
@@ -105,12 +162,13 @@ def _frames(address: str, duration_s: float | None, activity: str) -> Iterator[t
         print(f"{activity} {address}", flush=True)
         while True:
             try:
-                timed = reader.receive(None)
+                timed = reader.receive(timeout_s)
             except can.CanOperationError as error:
                 raise _BusClosed(str(error)) from None
             except KeyboardInterrupt:
                 return
             if timed is None:
+                tell_silence()
                 continue
             if end_ns is None and duration_s is not None:
                 end_ns = timed[0] + round(duration_s * 1e9)
