@@ -29,6 +29,7 @@ sys.path.insert(0, str(TOOLS / "src"))
 
 from salient.builder import build_preset  # noqa: E402  (needs the path above)
 from salient.cli import make_parser  # noqa: E402
+from salient.errors import exit_code  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -259,7 +260,7 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
     return found
 
 
-def main() -> None:
+def main() -> int:
     """Reads the command line, prepares, and executes the command in place of this process."""
     options = make_parser().parse_args()
     install = not options.no_install
@@ -296,4 +297,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

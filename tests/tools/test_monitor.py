@@ -145,8 +145,8 @@ def test_node_that_was_never_heard_is_exit_code_1(listen, end):
         process.send_signal(signal.SIGINT)
     else:
         listen.bench.simulator.close()
-        text = f"salient: {listen.bench.address}: the drive's bus closed before --duration-s 0.2 had passed: " \
-               f"the drive was stopped\n{text}"
+        early = "closed before --duration-s 0.2 had passed: the drive was stopped"
+        text = f"salient: {listen.bench.address}: the drive's bus {early}\n{text}"
     assert finish(process)[1:] == (text, 1)
 
 
@@ -201,8 +201,8 @@ def test_interface_without_any_drive_is_told(salient_without_build, monkeypatch)
     monkeypatch.setattr(monitor.signal, "signal", lambda *_: None)
     done = salient_without_build("monitor", "--can", "socketcan:can0")
     assert done.returncode == 1
-    assert done.stderr.splitlines()[0] == ("salient: socketcan:can0: no frame of a drive with node number 0 (--node) or "
-                                           "of any other drive; listening on")
+    assert done.stderr.splitlines()[0] == ("salient: socketcan:can0: no frame of a drive with node number 0 (--node) "
+                                           "or of any other drive; listening on")
     assert len(done.stderr.splitlines()) == 2
 
 

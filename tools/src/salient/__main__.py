@@ -9,28 +9,36 @@ from pathlib import Path
 
 from salient.cli import make_parser
 from salient.config import OPTIONS
-from salient.errors import UsageError, exit_code
+from salient.errors import RunFailed, UsageError, exit_code
 from salient.paths import BUILD, make_folder, scenario_path
 
 
 def main() -> int:
     """Runs a command; returns the exit code: 0 done, 1 the thing tested failed, 2 a mistake of the caller."""
-    options = make_parser().parse_args()
+    options = argparse.Namespace()
+    return exit_code(lambda: _run_command(options), lambda: _place(options))
+
+
+def _place(options: argparse.Namespace) -> str | None:
+    """The option of what a command writes, with its value."""
+    for name in ("out", "json", "file"):
+        if value := getattr(options, name, None):
+            return str(value) if name == "file" else f"--{name} {value}"
+    return None
+
+
+def _run_command(options: argparse.Namespace) -> int:
+    make_parser().parse_args(namespace=options)
     if getattr(options, "can", None) == "auto":
         options.can = _automatic_can()
     try:
-        return exit_code(lambda: _COMMANDS[options.command](options))
-    except BrokenPipeError:
-        # The reader of the output has closed it, as head does.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _COMMANDS[options.command](options)
     except Exception as error:
         can = sys.modules.get("can")  # most commands start faster without it
         if can is None or not isinstance(error, can.CanError):
             raise
         bus = getattr(options, "can", None) or "the bus"
-        print(f"salient: {error}" if bus in str(error) else f"salient: {bus}: {error}", file=sys.stderr)
-        return 1
+        raise RunFailed(str(error) if bus in str(error) else f"{bus}: {error}") from None
 
 
 def _automatic_can() -> str:

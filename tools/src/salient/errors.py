@@ -1,6 +1,10 @@
 """Mistakes of the user, as opposed to failures."""
 
+import contextlib
 import difflib
+import errno
+import os
+import select
 import sys
 from collections.abc import Callable, Iterable
 
@@ -46,19 +50,59 @@ class RunFailed(Exception):
     """The thing tested failed; one line. Exit code 1."""
 
 
-def exit_code(command: Callable[[], int]) -> int:
-    """Runs a command; returns its exit code, and after one line for what it raises 1 (RunFailed), 2 (UsageError) or 130
-    (Ctrl-C)."""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""Errors of a write, which names no file."""
+
+
+def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: None) -> int:
+    """Runs a command; returns its exit code, and after one line for what it raises 1 (RunFailed, a connection), 2
+    (UsageError, files and folders) or 130 (Ctrl-C). A reader of the output that has enough, as head, is no failure.
+
+    This is the only place that ends a command for what lies outside it. out: the value of --out, which stands for the
+    file of a write that failed.
+    """
     try:
-        return command()
+        try:
+            code = command()
+        except SystemExit as end:  # of the command line
+            code = end.code if isinstance(end.code, int) else 0
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
     except UsageError as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 2
+        return _end(str(error), 2)
     except RunFailed as error:
-        print(f"salient: {error}", file=sys.stderr)
-        return 1
+        return _end(str(error), 1)
     except KeyboardInterrupt:
-        return 130
+        return _end("interrupted", 130)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and _output_has_no_reader():
+            _discard_output()
+            return 0
+        where = error.filename if error.filename is not None else out() if error.errno in _FULL else None
+        text = error.strerror or str(error) or type(error).__name__
+        is_file = error.filename is not None or error.errno in _FULL
+        is_connection = isinstance(error, ConnectionError | TimeoutError) or not is_file
+        _discard_output()  # what could not be written is not tried again at the end of the process
+        return _end(text if where is None else f"{where}: {text}", 1 if is_connection else 2)
+
+
+def _end(line: str, code: int) -> int:
+    with contextlib.suppress(OSError, ValueError):  # standard error may be closed or full, too
+        print(f"salient: {' '.join(line.splitlines())}", file=sys.stderr, flush=True)
+    return code
+
+
+def _output_has_no_reader() -> bool:
+    """Whether standard output is a pipe whose reader has closed it; else the pipe is that of a bus or a child."""
+    poll = select.poll()
+    poll.register(1, 0)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def _discard_output() -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def cannot_write(where: str, error: OSError) -> UsageError:

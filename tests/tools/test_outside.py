@@ -1,0 +1,122 @@
+"""Failures outside the tools, as a full disk, an interrupt or a lost connection, are one line and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from salient import __main__ as salient_main
+from salient.paths import ROOT
+
+SALIENT = (sys.executable, "-m", "salient")
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 kB that has no room left."""
+    folder = tmp_path / "full"
+    folder.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True, text=True)
+    if done.returncode != 0:
+        pytest.skip(f"a file system cannot be mounted: {done.stderr.strip()}")
+    (folder / "filler").write_bytes(bytes(32 * 1024))
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+def assert_one_line(errors: str, *texts: str) -> None:
+    assert errors.startswith("salient: ") and errors.count("\n") == 1, errors
+    assert all(text in errors for text in texts), errors
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".mf4"])
+def test_full_disk_ends_a_log_with_one_line(make_bench: Callable, full_disk: Path, suffix: str) -> None:
+    bench, path = make_bench(), full_disk / f"can{suffix}"
+    with subprocess.Popen([*SALIENT, "log", "--can", bench.address, "--out", path], stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE, text=True) as logger:
+        assert logger.stdout.readline()
+        bench.run_for(1.0)
+        bench.simulator.close()
+        errors = logger.communicate()[1]
+    assert logger.returncode == 2
+    assert_one_line(errors, str(path), "No space left on device")
+
+
+@pytest.mark.parametrize("arguments", [
+    ("machine", "saturating", "--out"), ("machine", "saturating", "--out", "machine", "--dbc"),
+    ("run", "start_600", "--out"),
+], ids=lambda arguments: f"{arguments[0]}{arguments[-1]}")
+def test_full_disk_ends_other_commands_with_one_line(full_disk: Path, tmp_path: Path, arguments: tuple[str, ...]
+                                                     ) -> None:
+    (full_disk / "rest").write_bytes(bytes(24 * 1024))
+    target = full_disk / "x.dbc" if arguments[-1] == "--dbc" else full_disk
+    done = subprocess.run([*SALIENT, *arguments, target], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert_one_line(done.stderr, str(full_disk), "No space left on device")
+
+
+@pytest.mark.parametrize("arguments", [("machine", "saturating"), ("--help",), ("sim", "--help")])
+def test_full_standard_output_is_one_line(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*SALIENT, *arguments], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert_one_line(done.stderr, "No space left on device")
+
+
+@pytest.mark.parametrize("arguments", [("machine", "saturating"), ("--help",)])
+def test_output_without_a_reader_is_no_failure(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([*SALIENT, *arguments], cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(("error", "code", "line"), [
+    (PermissionError(errno.EACCES, "Permission denied", "mine.toml"), 2, "mine.toml: Permission denied"),
+    (OSError(errno.ENOSPC, "No space left on device"), 2, "--out here: No space left on device"),
+    (ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"), 1, "Connection reset by peer"),
+    (BrokenPipeError(errno.EPIPE, "Broken pipe"), 1, "Broken pipe"),
+    (TimeoutError(), 1, "TimeoutError"),
+    (KeyboardInterrupt(), 130, "interrupted"),
+], ids=lambda value: type(value).__name__)
+def test_failure_of_the_outside_is_one_line(salient_without_build: Callable, monkeypatch: pytest.MonkeyPatch,
+                                            error: BaseException, code: int, line: str) -> None:
+    def fail(_: object) -> int:
+        raise error
+
+    monkeypatch.setitem(salient_main._COMMANDS, "machine", fail)
+    done = salient_without_build("machine", "saturating", "--out", "here")
+    assert (done.returncode, done.stderr) == (code, f"salient: {line}\n")
+
+
+def test_mistake_in_the_tools_keeps_its_traceback(salient_without_build: Callable, monkeypatch: pytest.MonkeyPatch
+                                                  ) -> None:
+    monkeypatch.setitem(salient_main._COMMANDS, "machine", lambda _: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        salient_without_build("machine", "saturating")
+
+
+def test_interrupt_of_the_preparation_is_one_line(tmp_path: Path) -> None:
+    """A pip that takes its time, in a copy of what the launcher needs."""
+    code = ("import sys, time; sys.path.insert(0, sys.argv[1]); import launcher, subprocess; "
+            "launcher.install_packages = lambda *_: None; "
+            "launcher.make_environment = lambda *_: subprocess.run([sys.executable, '-c', "
+            "'import time; print(1, flush=True); time.sleep(60)']); "
+            "sys.argv[1:] = ['machine', 'saturating']; sys.exit(launcher.exit_code(launcher.main))")
+    with subprocess.Popen([sys.executable, "-c", code, ROOT / "tools"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                          text=True, cwd=tmp_path, start_new_session=True) as launcher:
+        assert launcher.stdout.readline() == "1\n"
+        time.sleep(0.1)
+        os.killpg(launcher.pid, signal.SIGINT)
+        errors = launcher.communicate()[1]
+    assert launcher.returncode == 130
+    assert errors.endswith("salient: interrupted\n")
