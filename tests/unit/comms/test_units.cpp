@@ -9,6 +9,8 @@ extern "C" {
 #include "comms/units.h"
 }
 
+#include "support/wide_integer.h"
+
 namespace {
 
 constexpr double PI = 3.14159265358979323846;
@@ -71,6 +73,23 @@ TEST(Units, torque_is_the_nearest) {
     EXPECT_EQ(units_torque_q8(-0x8001), -1);
     EXPECT_EQ(units_torque_q8(INT32_MIN), -32768);
     EXPECT_EQ(units_torque_q8(INT32_MAX), 32768);
+}
+
+// Every conversion by a power of two, over the whole range: to nearest, halves towards plus infinity.
+TEST(Units, angles_deviations_and_torques_are_the_nearest_for_any_value) {
+    using namespace wide_integer;
+    std::mt19937 random(4);
+    for (int i = 0; i < 200000; i++) {
+        const int32_t value = any(random);
+        ASSERT_EQ(units_angle_u16(uint32_t(value)), uint16_t(nearest(uint32_t(value), power_of_2(16)))) << value;
+        ASSERT_EQ(units_deviation_q20(value), int32_t(nearest(value, power_of_2(12)))) << value;
+        ASSERT_EQ(units_torque_q8(value), int32_t(nearest(value, power_of_2(16)))) << value;
+        const int32_t of_24_bits = value >> 8;
+        ASSERT_EQ(units_torque_q24(of_24_bits), int64_t(of_24_bits) * 256);
+        ASSERT_EQ(units_quarter_rpm(value), int32_t(nearest(value, 250))) << value;
+    }
+    EXPECT_EQ(units_deviation_q20(INT32_MAX), 1 << 19);
+    EXPECT_EQ(units_deviation_q20(INT32_MIN), -(1 << 19));
 }
 
 } // namespace

@@ -1,4 +1,5 @@
 // The sliding-mode speed control against its reference model, its stability, and the reaching law as published.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -12,6 +13,7 @@ extern "C" {
 }
 
 #include "support/reference_models.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -87,6 +89,30 @@ TEST(SpeedSmc, reaching_torque_error_is_within_its_bound_over_the_whole_range) {
     EXPECT_LT(worst, 9e-5);
 }
 
+// Two LSBs of the gain are much of a small one.
+TEST(SpeedSmc, reaching_torque_error_is_within_its_bound_for_any_parameters) {
+    std::mt19937 random(5);
+    double worst_of_bound = 0.0;
+    for (int i = 0; i < 300000; i++) {
+        const int32_t delta_max_q27 = to_fixed(10.0 / std::log(2.0), Q27);
+        const speed_smc_parameters_t parameters = {
+            .gain_q24 = std::max(wide_integer::any_up_to(random, INT32_MAX), 1),
+            .epsilon_q31 = std::max(wide_integer::any_up_to(random, INT32_MAX), SPEED_SMC_EPSILON_MIN_Q31),
+            .delta_q27 = wide_integer::any_up_to(random, delta_max_q27),
+            .friction_q30 = 0};
+        const int32_t x_q22 = wide_integer::any(random);
+        const double exact = model_torque_Nm(parameters, x_q22);
+        const int32_t torque_q24 = speed_smc_reaching_torque_q24(&parameters, x_q22);
+        const double bound = 1e-4 * std::fabs(exact) + 2.0 * std::fabs(exact) / parameters.gain_q24 + 1.0 / Q20;
+        const double saturated = std::clamp(exact, -INT32_MAX / Q24, INT32_MAX / Q24);
+        const double error = std::fabs(torque_q24 / Q24 - saturated);
+        ASSERT_LE(error, bound) << "x " << x_q22 << " gain " << parameters.gain_q24 << " eps " << parameters.epsilon_q31
+                                << " delta " << parameters.delta_q27;
+        worst_of_bound = std::max(worst_of_bound, error / bound);
+    }
+    EXPECT_GT(worst_of_bound, 0.25) << "four times the error would not show";
+}
+
 TEST(SpeedSmc, reaching_torque_is_exactly_odd_and_saturates) {
     const speed_smc_parameters_t parameters = parameters_of(6000.0, 0.01, 10.0);
     for (const int32_t x_q22 : speeds()) {
@@ -114,6 +140,42 @@ TEST(SpeedSmc, torque_includes_load_and_friction_and_is_clamped_to_the_limits) {
         const double torque = torque_q24_of(parameters, reference_q22, speed_q22, load_q24) / Q24;
         ASSERT_NEAR(torque, clamped, 1e-4 * 40.0 + 1.0 / Q20);
     }
+}
+
+// Exactly: sums that saturate, friction rounded down. A friction torque that saturates is within 16 LSB of it.
+TEST(SpeedSmc, torque_is_the_saturated_sum_of_its_parts_for_any_arguments) {
+    using namespace wide_integer;
+    std::mt19937 random(6);
+    int exact = 0, saturating = 0, inside = 0;
+    for (int i = 0; i < 300000; i++) {
+        const speed_smc_parameters_t parameters = {
+            .gain_q24 = 1, .epsilon_q31 = INT32_MAX, .delta_q27 = 0, .friction_q30 = any_up_to(random, INT32_MAX)};
+        const int32_t reaching_q24 = any(random), speed_q22 = any(random), load_q24 = any(random);
+        const int32_t one_q24 = any(random), other_q24 = any(random);
+        const int32_t min_q24 = i % 2 ? INT32_MIN : std::min(one_q24, other_q24);
+        const int32_t max_q24 = i % 2 ? INT32_MAX : std::max(one_q24, other_q24);
+        const int32_t torque_q24 =
+            speed_smc_torque_q24(&parameters, reaching_q24, speed_q22, load_q24, min_q24, max_q24);
+        const wide_t friction_q24 = rounded_down(wide_t(speed_q22) * parameters.friction_q30, power_of_2(28));
+        const auto with = [&](wide_t of_friction_q24) {
+            const wide_t sum_q24 = saturated(wide_t(reaching_q24) + load_q24) + of_friction_q24;
+            return std::clamp(saturated(sum_q24), min_q24, max_q24);
+        };
+        const int32_t nearest_q24 = with(saturated(friction_q24));
+        if (fits(friction_q24)) {
+            ASSERT_EQ(torque_q24, nearest_q24) << reaching_q24 << " " << speed_q22 << " " << load_q24;
+            exact++;
+            inside += nearest_q24 > min_q24 && nearest_q24 < max_q24;
+        } else {
+            const int32_t least_q24 = with(saturated(friction_q24) - (friction_q24 > 0 ? 15 : -15));
+            ASSERT_GE(torque_q24, std::min(nearest_q24, least_q24)) << speed_q22;
+            ASSERT_LE(torque_q24, std::max(nearest_q24, least_q24)) << speed_q22;
+            saturating++;
+        }
+    }
+    EXPECT_GT(inside, 100000);
+    EXPECT_GT(exact, inside);
+    EXPECT_GT(saturating, 1000);
 }
 
 TEST(SpeedSmc, nothing_overflows_at_the_ends_of_all_ranges) {
