@@ -1,6 +1,8 @@
 // Integral of requested less estimated torque.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <random>
 
 #include <gtest/gtest.h>
 
@@ -9,6 +11,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -58,6 +61,29 @@ TEST(TorqueOffset, is_at_most_an_eighth_of_the_largest_torque_and_overflows_noth
         }
         EXPECT_NEAR(torque_offset_q24(&drive.offset) / Q24, torque_q24 < 0 ? 2.0 : -2.0, 1e-6);
     }
+}
+
+TEST(TorqueOffset, is_the_clamped_sum_of_saturated_differences_rounded_down_for_any_arguments) {
+    using namespace wide_integer;
+    std::mt19937 random(1);
+    int inside = 0;
+    for (int drive = 0; drive < 200; drive++) {
+        const torque_offset_parameters_t parameters =
+            torque_offset_configure(1000 + random() % 100000, any_up_to(random, INT32_MAX));
+        const wide_t limit_q56 = wide_t(parameters.limit_q24) << 32;
+        torque_offset_t offset{};
+        wide_t exact_q56 = 0;
+        for (int k = 0; k < 500; k++) {
+            const wide_t offset_q24 = rounded_down(exact_q56, power_of_2(32));
+            ASSERT_EQ(torque_offset_q24(&offset), int32_t(offset_q24)) << drive << " " << k;
+            inside += exact_q56 != 0 && exact_q56 < limit_q56 && exact_q56 > -limit_q56;
+            const int32_t reference_q24 = any(random), torque_q24 = any(random);
+            torque_offset_step(&parameters, &offset, reference_q24, torque_q24, false);
+            const wide_t error_q24 = saturated(wide_t(saturated(reference_q24 - offset_q24)) - torque_q24);
+            exact_q56 = std::clamp(exact_q56 + error_q24 * parameters.gain_q32, -limit_q56, limit_q56);
+        }
+    }
+    EXPECT_GT(inside, 40000) << "of 100000";
 }
 
 } // namespace
