@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <random>
 
 #include <gtest/gtest.h>
 
@@ -106,6 +107,24 @@ TEST(TorqueSharing, advance_moves_turn_on_and_turn_off_and_causes_a_share_at_the
     const torque_sharing_window_t early = torque_sharing_window(&p, 32768);
     EXPECT_NEAR(torque_sharing_q15(&early, HALF_REV_Q32) / Q15, reference_model::torque_sharing_t::cubic(20.0 / 60.0),
                 1e-3);
+}
+
+TEST(TorqueSharing, a_window_is_moved_by_products_that_are_rounded_down) {
+    std::mt19937 random(1);
+    for (int i = 0; i < 100000; i++) {
+        torque_sharing_parameters_t p = parameters_of(3, 184.0, 344.0);
+        p.turn_on_advance = degrees(24.0) - random() % 1000000;
+        p.turn_off_advance = degrees(16.0) - random() % 1000000;
+        const auto advance_q15 = int32_t(random() % 32769);
+        const torque_sharing_window_t window = torque_sharing_window(&p, advance_q15);
+        const auto moved = [&](uint32_t by) { return uint32_t(uint64_t(by) * uint32_t(advance_q15) / 32768); };
+        ASSERT_EQ(window.turn_on, p.turn_on - moved(p.turn_on_advance));
+        ASSERT_EQ(window.turn_on + window.stroke + window.overlap, p.turn_off - moved(p.turn_off_advance));
+        // 2^47 / overlap: the overlap without its lower 15 bits, and what the quotient is rounded down by.
+        const double least = std::ldexp(1.0, 47) / (window.overlap | 0x7fff) - 1.0;
+        ASSERT_GE(window.reciprocal, least);
+        ASSERT_LE(window.reciprocal, std::ldexp(1.0, 47) / (window.overlap & ~0x7fffu));
+    }
 }
 
 TEST(TorqueSharing, without_overlap_one_phase_conducts_at_a_time) {
