@@ -10,6 +10,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -92,6 +93,46 @@ TEST(AppliedFlux, falls_below_0_while_there_is_a_current) {
     applied_flux_step(&flux, &period, 0, -32768, 640);
     EXPECT_EQ(flux.at_sample_q29[0], 0);
     EXPECT_EQ(flux.next_q29[0], -(1 << 17));
+}
+
+TEST(AppliedFlux, a_period_errs_by_half_an_LSB_for_each_product_and_its_sum_saturates_for_any_arguments) {
+    using namespace wide_integer;
+    std::mt19937 random(4);
+    int inside = 0;
+    for (int i = 0; i < 200000; i++) {
+        applied_flux_t flux{};
+        const int32_t start_q29 = any(random), current_q9 = any_up_to(random, (1 << 16) - 1);
+        const int32_t duty_q15 = any_up_to(random, 65536) - 32768;
+        const applied_flux_period_t period = {any_up_to(random, 1 << 30), -any_up_to(random, INT32_MAX), 640};
+        flux.next_q29[2] = start_q29;
+        applied_flux_step(&flux, &period, 2, duty_q15, current_q9);
+        EXPECT_EQ(flux.at_sample_q29[2], start_q29);
+        // Twice the change, in units of 2^-32 LSB: duty Q15 by Wb Q32, current Q9 by ohm s Q40.
+        const wide_t gained = wide_t(duty_q15) * period.full_q32 * power_of_2(15);
+        const wide_t dropped = wide_t(current_q9) * period.against_q40 * power_of_2(13);
+        const double then = start_q29 + double(gained + dropped) / 8589934592.0;
+        const double least = current_q9 > 640 ? -2147483648.0 : 0.0;
+        ASSERT_LE(std::fabs(flux.next_q29[2] - std::clamp(then, least, 2147483647.0)), 1.0001)
+            << start_q29 << " " << duty_q15 << " " << current_q9;
+        inside += then > least && then < 2147483647.0;
+    }
+    EXPECT_GT(inside, 80000) << "of 200000";
+}
+
+TEST(AppliedFlux, independent_errors_together_are_within_12_percent_of_the_root_of_the_sum_of_their_squares) {
+    std::mt19937 random(5);
+    double least = 2.0, most = 0.0;
+    for (int i = 0; i < 100000; i++) {
+        const int64_t a = 1000 + wide_integer::any_up_to(random, INT32_MAX - 1000), b = int64_t(a * (random() / REV));
+        const double ratio = double(applied_flux_independent(a, b)) / std::hypot(double(a), double(b));
+        ASSERT_EQ(applied_flux_independent(b, a), applied_flux_independent(a, b));
+        least = std::min(least, ratio);
+        most = std::max(most, ratio);
+    }
+    EXPECT_GT(least, 0.88);
+    EXPECT_LT(least, 0.89) << "of equal ones";
+    EXPECT_LT(most, 1.12);
+    EXPECT_GT(most, 1.03);
 }
 
 } // namespace
