@@ -93,7 +93,8 @@ typedef struct {
     flux_observer_parameters_t flux; /* with R Ts / s */
 } table_scale_factors_t;
 
-/* Factors for a scale from TABLE_SCALE_MIN_Q30 to TABLE_SCALE_MAX_Q30; rounded to nearest. [background] */
+/* Factors for a scale from TABLE_SCALE_MIN_Q30 to TABLE_SCALE_MAX_Q30: 1 / s is rounded to 2^-30, what is divided by s
+ * to nearest after that, so that its error is 1/2 LSB and 2^-31 of the dividend. [background] */
 table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period_q40,
                                           const flux_observer_parameters_t *flux);
 

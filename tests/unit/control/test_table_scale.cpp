@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <random>
 
 #include <gtest/gtest.h>
 
@@ -12,6 +13,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -271,6 +273,47 @@ TEST(TableScaleSums, overflow_nothing) {
             ASSERT_LE(state.scale_q30, TABLE_SCALE_MAX_Q30);
         }
     }
+}
+
+TEST(TableScaleFactors, are_within_their_roundings_for_any_scale) {
+    std::mt19937 random(1);
+    double worst = 0.0, worst_of_step = 0.0;
+    for (int i = 0; i < 100000; i++) {
+        const int32_t range_q30 = TABLE_SCALE_MAX_Q30 - TABLE_SCALE_MIN_Q30;
+        const int32_t scale_q30 = TABLE_SCALE_MIN_Q30 + wide_integer::any_up_to(random, range_q30);
+        const int32_t period_q40 = 1 + wide_integer::any_up_to(random, to_fixed(50e-6, Q40) - 1);
+        const int32_t resistance_q40 = wide_integer::any_up_to(random, INT32_MAX / 2);
+        const flux_observer_parameters_t flux = {.gain_q30 = 1 << 28, .resistance_period_q40 = resistance_q40};
+        const table_scale_factors_t f = table_scale_factors(scale_q30, period_q40, &flux);
+        const double inverse = Q30 / scale_q30;
+        ASSERT_EQ(f.excess_q31, 2 * (int64_t(scale_q30) - TABLE_SCALE_ONE_Q30));
+        ASSERT_LE(std::fabs(f.inverse_excess_q31 / Q31 - (inverse - 1.0)), 1.0001 / Q31) << scale_q30;
+        // 1 / s has been rounded before.
+        ASSERT_LE(std::fabs(f.period_q40 - period_q40 * inverse), 0.5001 + period_q40 / Q31) << scale_q30;
+        const double resistance_error = std::fabs(f.flux.resistance_period_q40 - resistance_q40 * inverse);
+        ASSERT_LE(resistance_error, 0.5001 + resistance_q40 / Q31) << scale_q30 << " " << resistance_q40;
+        worst = std::max(worst, std::fabs(f.inverse_excess_q31 / Q31 - (inverse - 1.0)) * Q31);
+        worst_of_step = std::max(worst_of_step, std::fabs(f.period_q40 - period_q40 * inverse));
+    }
+    EXPECT_GT(worst, 0.9);
+    EXPECT_GT(worst_of_step, 0.45);
+}
+
+TEST(TableScaleFactors, a_torque_times_a_factor_is_rounded_to_2_lsb_and_saturated_for_any_arguments) {
+    std::mt19937 random(2);
+    double worst = 0.0;
+    int saturating = 0;
+    for (int i = 0; i < 200000; i++) {
+        const int32_t torque_q24 = wide_integer::any(random), excess_q31 = wide_integer::any(random);
+        const double exact = torque_q24 + torque_q24 / Q31 * excess_q31;
+        const double error =
+            std::fabs(table_scale_multiply(torque_q24, excess_q31) - std::clamp(exact, -2147483648.0, 2147483647.0));
+        ASSERT_LE(error, 1.0001) << torque_q24 << " " << excess_q31;
+        worst = std::max(worst, error);
+        saturating += std::fabs(exact) > Q31;
+    }
+    EXPECT_GT(worst, 0.9);
+    EXPECT_GT(saturating, 1000);
 }
 
 } // namespace
