@@ -39,7 +39,7 @@ static inline void count_course_begin(count_course_t *course, uint32_t angle) {
     course->angle_q64 = (uint64_t)angle << 32;
 }
 
-/* One step of some periods: l e in rad/s, Q9.22, rounded down, from the speed reference in rad/s, Q9.22, and the
+/* One step of some periods: l e in rad/s, Q9.22, rounded to 4 LSB, from the speed reference in rad/s, Q9.22, and the
  * estimated angle in 2^-32 rev. */
 int32_t count_course_step(const count_course_parameters_t *parameters, count_course_t *course, int32_t reference_q22,
                           uint32_t angle, uint32_t periods);

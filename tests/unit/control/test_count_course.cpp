@@ -1,6 +1,8 @@
 // Course of the counts: its speed against the formula in double precision, and its limits.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <random>
 
 #include <gtest/gtest.h>
 
@@ -10,6 +12,7 @@ extern "C" {
 }
 
 #include "support/reference_builders.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -66,6 +69,35 @@ TEST_F(CountCourse, waits_for_a_rotor_that_is_more_than_a_count_off) {
         EXPECT_NEAR(speed + step_rad_s(speed, angle), off > 0 ? 0.0 : 2.0 * speed, 1e-5);
         EXPECT_EQ(int32_t(uint32_t(course.angle_q64 >> 32) - angle), (off > 0 ? -1 : 1) * int32_t(COUNT));
     }
+}
+
+TEST_F(CountCourse, is_rounded_to_4_lsb_and_its_angle_exact_for_any_encoder_reference_and_angle) {
+    using namespace wide_integer;
+    std::mt19937 random(1);
+    double worst = 0.0;
+    int within = 0;
+    for (int i = 0; i < 200000; i++) {
+        const unsigned bits = 8 + random() % 23;
+        const count_course_parameters_t p = count_course_configure(parameters.angle_step_q32, bits);
+        const int32_t count = 1 << (32 - bits);
+        const int32_t reference_q22 = any(random);
+        const uint32_t periods = 1 + random() % 8, start = uint32_t(random());
+        const wide_t turned_q64 = wide_t(reference_q22) * p.angle_step_q32 * periods;
+        const auto reached = uint32_t(uint64_t((wide_t(start) << 32) + turned_q64) >> 32);
+        const int32_t ahead = any(random) >> random() % 8 >> random() % bits;
+        count_course_begin(&course, start);
+        const int32_t result_q22 = count_course_step(&p, &course, reference_q22, reached - uint32_t(ahead), periods);
+        const int32_t error = std::clamp(ahead, -count, count);
+        const int32_t rate_q22 = std::clamp(saturated(std::abs(int64_t(reference_q22))), p.least_q22, p.most_q22);
+        const double off = std::fabs(result_q22 - double(rate_q22) * error / count);
+        ASSERT_LE(off, 2.0) << bits << " bits, " << reference_q22 << " " << ahead;
+        ASSERT_EQ(int32_t(uint32_t(course.angle_q64 >> 32) - reached), error - ahead);
+        ASSERT_EQ(uint32_t(course.angle_q64), uint32_t(uint64_t(turned_q64))) << "what is below 2^-32 rev is kept";
+        worst = std::max(worst, off);
+        within += ahead == error && error != 0;
+    }
+    EXPECT_GT(worst, 1.9);
+    EXPECT_GT(within, 50000);
 }
 
 } // namespace
