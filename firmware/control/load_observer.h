@@ -62,7 +62,7 @@ load_observer_model_t load_observer_model(uint32_t control_rate_hz, int32_t iner
 load_observer_inertia_t load_observer_inertia(const load_observer_model_t *model, int32_t k);
 
 /* Acceleration in rad/s^2 (2^speed_exponent of SI, as every speed) by a torque (N m, Q7.24) on an inertia (kg m^2,
- * Q1.30), rounded to nearest: 19 bits for 40 N m. */
+ * Q1.30), rounded towards zero: 19 bits for 40 N m on 10^-4 kg m^2. */
 int64_t load_observer_acceleration(int32_t torque_q24, int32_t inertia_q30);
 
 /* Estimate: given angle (2^-32 rev), speed 0, load torque 0. The estimate converges to a spinning rotor within 10 / w0
@@ -75,8 +75,9 @@ int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle
 
 /* One sample: corrects with its innovation (-2^27..2^27 - 1), then predicts one period ahead with the machine torque (N
  * m, Q7.24). Afterwards angle, speed and load torque are the estimate for the coming sample. 64-bit products and angle
- * accumulator; speed correction and friction torque are rounded down, the other terms to nearest; speed and load torque
- * saturate. */
+ * accumulator. Speed correction, friction torque and half of the speed change are rounded down, the speed change to
+ * nearest, the load correction to nearest before its factor and down after it; speed and load torque saturate, the
+ * speed correction to within 16 LSB of the end. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
                         const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t innovation,
                         int32_t torque_q24);

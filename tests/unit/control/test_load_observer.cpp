@@ -1,4 +1,5 @@
 // The load observer: gains against their formulas, estimates against its reference model.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -10,6 +11,7 @@ extern "C" {
 }
 
 #include "support/reference_builders.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -149,6 +151,69 @@ TEST(LoadObserver, reports_the_innovation_before_the_step_and_the_speed_correcti
         model.step(clamped / REV, 0.0);
         EXPECT_NEAR(observer.speed_correction_q22 / Q22, model.speed_correction, 1.0 / Q22);
     }
+}
+
+// Every term with its rounding, for any gains and estimates. A speed correction that saturates is within 16 LSB of the
+// end, which makes the rest of that sample uncertain.
+TEST(LoadObserver, a_step_rounds_its_terms_as_stated_and_its_sums_saturate) {
+    using namespace wide_integer;
+    std::mt19937 random(7);
+    int compared = 0, limited = 0;
+    for (int i = 0; i < 300000; i++) {
+        load_observer_gains_t gains{};
+        gains.angle_gain_q28 = any_up_to(random, 1 << 28);
+        gains.speed_gain_q24 = any_up_to(random, INT32_MAX);
+        gains.load_gain_q28 = -any_up_to(random, INT32_MAX);
+        gains.load_factor_q4 = 16 << random() % 21;
+        const load_observer_model_t model = {0, any_up_to(random, INT32_MAX), any_up_to(random, INT32_MAX)};
+        const load_observer_inertia_t inertia = {any_up_to(random, INT32_MAX), int32_t(random() % 5)};
+        load_observer_t observer{};
+        observer.angle_q64 = uint64_t(random()) << 32 | random();
+        observer.speed_q22 = any(random);
+        observer.load_torque_q24 = any(random) / 2;
+        const load_observer_t before = observer;
+        const int32_t innovation = any(random) >> 4, torque_q24 = any(random);
+        load_observer_step(&model, &gains, &inertia, &observer, innovation, torque_q24);
+
+        const wide_t innovation_q4 = wide_t(innovation) * 16;
+        const wide_t correction_q22 = rounded_down(innovation_q4 * gains.speed_gain_q24, power_of_2(28));
+        const wide_t speed_q22 = saturated(before.speed_q22 + correction_q22);
+        const wide_t factor_q4 = wide_t(gains.load_factor_q4) * 4 >> inertia.load_shift;
+        const wide_t load_steps = nearest(innovation_q4 * gains.load_gain_q28, power_of_2(32));
+        const wide_t load_change_q24 = rounded_down(load_steps * factor_q4, power_of_2(4));
+        const wide_t load_q24 = before.load_torque_q24 + load_change_q24;
+        const wide_t friction_q24 = rounded_down(speed_q22 * model.friction_q30, power_of_2(28));
+        ASSERT_LE(std::llabs(int64_t(observer.speed_correction_q22) - saturated(correction_q22)),
+                  fits(correction_q22) ? 0 : 15);
+        if (!fits(correction_q22) || !fits(friction_q24) || !fits(load_change_q24)) {
+            continue;
+        }
+        const wide_t limited_q24 = std::clamp(load_q24, -power_of_2(30), power_of_2(30) - 1);
+        const wide_t net_q24 = saturated(saturated(torque_q24 - friction_q24) - limited_q24);
+        const wide_t change_q22 = nearest(net_q24 * inertia.acceleration_q32, power_of_2(32));
+        const wide_t mean_q22 = saturated(speed_q22 + rounded_down(change_q22, 2));
+        const wide_t turn_q64 = innovation_q4 * gains.angle_gain_q28 + mean_q22 * model.angle_step_q32;
+        ASSERT_EQ(observer.speed_correction_q22, int32_t(correction_q22)) << i;
+        ASSERT_EQ(observer.load_torque_q24, int32_t(limited_q24)) << i;
+        ASSERT_EQ(observer.speed_q22, saturated(speed_q22 + change_q22)) << i;
+        ASSERT_EQ(observer.angle_q64, before.angle_q64 + uint64_t(turn_q64)) << i;
+        compared++;
+        limited += load_q24 != limited_q24;
+    }
+    EXPECT_GT(compared, 50000);
+    EXPECT_GT(limited, 1000);
+    EXPECT_GT(compared, 2 * limited);
+}
+
+TEST(LoadObserver, acceleration_is_that_of_the_torque_on_the_inertia_rounded_towards_zero) {
+    std::mt19937 random(8);
+    for (int i = 0; i < 100000; i++) {
+        const int32_t torque_q24 = wide_integer::any(random);
+        const int32_t inertia_q30 = 1 + wide_integer::any_up_to(random, INT32_MAX - 1);
+        ASSERT_EQ(load_observer_acceleration(torque_q24, inertia_q30), int64_t(torque_q24) * 64 / inertia_q30);
+    }
+    EXPECT_EQ(load_observer_acceleration(40 << 24, to_fixed(1e-4, Q30)), 400000); // 400000.7
+    EXPECT_EQ(load_observer_acceleration(-1, 65), 0);
 }
 
 // What the observer estimates and what its model does, for the same encoder readings and torques.
