@@ -1,4 +1,5 @@
 // Saturating arithmetic against 128-bit integers.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
@@ -153,6 +154,41 @@ TEST(FixedArithmetic, constants_are_the_nearest_numbers) {
     EXPECT_EQ(FIXED_CONSTANT(1, 3, 16), 21845);        // 21845.3
     EXPECT_EQ(FIXED_CONSTANT(2, 3, 16), 43691);        // 43690.7
     EXPECT_EQ(FIXED_CONSTANT(0, 7, 24), 0);
+}
+
+TEST(FixedArithmetic, magnitudes_and_saturations_to_fewer_bits_are_exact_for_any_value) {
+    for (const int32_t value : samples(9, 20000)) {
+        ASSERT_EQ(fixed_magnitude(value), uint32_t(std::llabs(int64_t(value))));
+        ASSERT_EQ(fixed_non_negative(value), std::max(value, 0));
+        ASSERT_EQ(fixed_saturate_u16(value), std::clamp(value, 0, 65535));
+        ASSERT_EQ(fixed_clamp_64(int64_t(value) << 20, -(INT64_C(1) << 45), INT64_C(1) << 44),
+                  std::clamp(int64_t(value) << 20, -(INT64_C(1) << 45), INT64_C(1) << 44));
+        ASSERT_EQ(fixed_shift_up_saturate_bits(value >> 8, 8, 20),
+                  std::clamp(value >> 8 << 8, -(1 << 19), (1 << 19) - 1));
+        ASSERT_EQ(fixed_shift_up_saturate_bits(value >> 3, 3, 32), value >> 3 << 3);
+    }
+}
+
+TEST(FixedArithmetic, products_that_are_shifted_round_as_stated_and_saturate_to_within_their_last_bits) {
+    const std::vector<int32_t> values = samples(10, 300);
+    const auto expect = [](int32_t result, wide_t exact, unsigned shift) {
+        if (saturated(exact) == exact) {
+            ASSERT_EQ(result, int32_t(exact)) << shift;
+        } else {
+            ASSERT_LE(std::abs(double(result) - double(saturated(exact))), std::ldexp(1.0, int(32 - shift))) << shift;
+        }
+    };
+    for (const int32_t a : values) {
+        for (const int32_t b : values) {
+            const wide_t product = wide_t(a) * b;
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_multiply_shift(a, b, 6), halves_up(product, 6), 6));
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_multiply_shift(a, b, 18), halves_up(product, 18), 18));
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_multiply_shift(a, b, 31), halves_up(product, 31), 31));
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_product_shift_saturate(a, b, 4), product >> 4, 4));
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_product_shift_saturate(a, b, 14), product >> 14, 14));
+            ASSERT_NO_FATAL_FAILURE(expect(fixed_product_shift_saturate(a, b, 28), product >> 28, 28));
+        }
+    }
 }
 
 } // namespace
