@@ -11,6 +11,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -136,6 +137,36 @@ TEST(TorqueMode, nothing_overflows_at_the_ends_of_all_ranges) {
             }
         }
     }
+}
+
+TEST(TorqueMode, the_reduction_is_rounded_up_once_and_down_in_each_step_for_any_arguments) {
+    using namespace wide_integer;
+    std::mt19937 random(2);
+    int reduced = 0;
+    for (int i = 0; i < 200000; i++) {
+        const int32_t max_q24 = any_up_to(random, 120 << 24), over_speed_q22 = (1 << 22) + any_up_to(random, 500 << 22);
+        const torque_mode_parameters_t p = torque_mode_configure(0, RATE_HZ, -max_q24, max_q24, over_speed_q22);
+        const wide_t range_q22 = over_speed_q22 / 16;
+        ASSERT_EQ(p.fold_back_range_q22, int32_t(range_q22));
+        ASSERT_GT(p.fold_back_q18 * range_q22, wide_t(max_q24) << 16) << "rounded up";
+        ASSERT_LE((p.fold_back_q18 - 1) * range_q22, wide_t(max_q24) << 16) << "by at most 1 LSB";
+        const int32_t before_q24 = any(random), commanded_q24 = any(random);
+        const int32_t speed_q22 = i % 2 ? any(random) : p.speed_end_q22 - any_up_to(random, int32_t(range_q22));
+        torque_mode_t mode{before_q24};
+        const int32_t found_q24 = torque_mode_step(&p, &mode, commanded_q24, speed_q22);
+        const wide_t target_q24 = std::clamp(commanded_q24, -max_q24, max_q24);
+        const wide_t change_q24 = std::max(saturated(target_q24 - before_q24), -INT32_MAX);
+        const wide_t torque_q24 = saturated(before_q24 + change_q24);
+        const wide_t below_end_q22 = wide_t(p.speed_end_q22) - std::abs(int64_t(speed_q22));
+        const wide_t room_q22 = std::clamp(below_end_q22, wide_t(0), range_q22);
+        const wide_t driving_q24 = rounded_down(room_q22 * p.fold_back_q18, power_of_2(16));
+        const wide_t expected_q24 =
+            speed_q22 < 0 ? std::max(torque_q24, -driving_q24) : std::min(torque_q24, driving_q24);
+        ASSERT_EQ(mode.torque_q24, int32_t(torque_q24)) << before_q24 << " " << commanded_q24;
+        ASSERT_EQ(found_q24, int32_t(expected_q24)) << commanded_q24 << " " << speed_q22;
+        reduced += expected_q24 != torque_q24 && expected_q24 != 0;
+    }
+    EXPECT_GT(reduced, 5000);
 }
 
 } // namespace
