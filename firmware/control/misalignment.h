@@ -136,7 +136,8 @@ typedef struct {
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);
 
 /* y in N m, Q7.24, from J / Ts (misalignment_parameters_t), load torque (N m, Q7.24) and speed correction (rad/s,
- * Q9.22) of the load observer. */
+ * Q9.22) of the load observer. The product is rounded to nearest and saturates to within 4 N m of the end; the
+ * difference saturates. */
 int32_t misalignment_disturbance_q24(int32_t inertia_rate_q8, int32_t load_torque_q24, int32_t speed_correction_q22);
 
 /* Instead of misalignment_step(), where the ripple teaches nothing: updates one phase by its flux linkage alone

@@ -16,6 +16,7 @@ extern "C" {
 
 #include "support/phase_map_results.h"
 #include "support/reference_builders.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -433,6 +434,27 @@ TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_
         misalignment_follow_flux(&parameters, &state, &machine_tables, angle_from_rev(0.75), 0, 0);
     }
     EXPECT_EQ(misalignment_slope_q24(&state), 0) << "without current";
+}
+
+TEST(MisalignmentDisturbance, is_load_torque_less_the_rounded_product_for_any_arguments) {
+    using namespace wide_integer;
+    std::mt19937 random(3);
+    int exact = 0, saturating = 0;
+    for (int i = 0; i < 200000; i++) {
+        const int32_t rate_q8 = any_up_to(random, INT32_MAX), load_q24 = any(random), correction_q22 = any(random);
+        const int32_t found_q24 = misalignment_disturbance_q24(rate_q8, load_q24, correction_q22);
+        const wide_t product_q24 = nearest(wide_t(correction_q22) * rate_q8, power_of_2(6));
+        const int32_t expected_q24 = saturated(wide_t(load_q24) - saturated(product_q24));
+        if (fits(product_q24)) {
+            ASSERT_EQ(found_q24, expected_q24) << rate_q8 << " " << load_q24 << " " << correction_q22;
+            exact++;
+        } else {
+            ASSERT_LT(std::llabs(int64_t(found_q24) - expected_q24), 4 << 24);
+            saturating++;
+        }
+    }
+    EXPECT_GT(exact, 50000);
+    EXPECT_GT(saturating, 10000);
 }
 
 } // namespace
