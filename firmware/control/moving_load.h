@@ -106,8 +106,8 @@ typedef struct {
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings);
 
 /* One sample: largest trend that rounding to counts causes, 2^-32 rev, Q28.4, at a rotation per period (angle_step,
- * magnitude, 2^-32 rev), by the formula above; n rounded down to quarters. One of q = 1..6 a sample, so the result is
- * that of up to 11 samples ago. A 32-bit division in every sixth. */
+ * magnitude, 2^-32 rev), by the formula above; |q r - p| is rounded down to 2^-15 count, n to quarters, the result to 1
+ * LSB. One of q = 1..6 a sample, so the result is that of up to 11 samples ago. A 32-bit division in every sixth. */
 uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, moving_load_rounding_t *rounding,
                                  uint32_t angle_step);
 

@@ -374,4 +374,32 @@ TEST(MovingLoad, the_largest_innovations_overflow_nothing) {
     }
 }
 
+// A distance from a ratio is rounded down to 2^-15 count, the result to 1 LSB.
+TEST(MovingLoad, rounding_is_that_of_its_formula_for_any_encoder_and_rotation) {
+    std::mt19937 random(2);
+    int beats = 0;
+    for (int i = 0; i < 100000; i++) {
+        const unsigned bits = 8 + random() % 25;
+        const moving_load_settings_t of = settings(bits, 20000 + random() % 80000);
+        const moving_load_parameters_t parameters = moving_load_configure(&of);
+        const double count = std::ldexp(1.0, int(32 - bits)), periods = parameters.time_constant;
+        // Anywhere, or near a ratio.
+        const double near = (1 + random() % 12) / double(1 + random() % 6) + (random() / REV - 0.5) * 0.02;
+        const auto angle_step = i % 2 ? uint32_t(random()) >> random() % 16 : uint32_t(std::fabs(near) * count);
+        const double counts = angle_step / count;
+        double least = 0.0, most = 0.0;
+        for (int q = 1; q <= 6; q++) {
+            const double distance = std::fabs(q * counts - std::round(q * counts));
+            const double closer = std::max(distance - 1.0 / 32768.0, 0.0);
+            least = std::max(least, 0.5 / q / (1.0 + std::floor(4.0 * distance * periods)));
+            most = std::max(most, 0.5 / q / (1.0 + std::floor(4.0 * closer * periods)));
+        }
+        const double rounding = rounding_of(parameters, angle_step);
+        ASSERT_GT(rounding, least * 16.0 * count - 1.0) << bits << " bits, " << counts;
+        ASSERT_LE(rounding, most * 16.0 * count) << bits << " bits, " << counts;
+        beats += most > 1.0 / 16.0;
+    }
+    EXPECT_GT(beats, 10000);
+}
+
 } // namespace
