@@ -52,8 +52,8 @@ typedef struct {
 } phase_cell_t;
 
 /* Dividend and divisor of quotients in Q2.13 by a rise. The dividend, y - middle or a curvature, is saturated to 2^25
- * units. The rise is rounded to 2^8 units, 2 uWb or 0.1 mN m over a column; one of less than that, or negative by
- * rounding, counts as 2^8. */
+ * units. The rise, from -2^7 on, is rounded to an odd multiple of 2^8 units, 2 uWb or 0.1 mN m over a column:
+ * within 1.5 times that; one of less, or negative by rounding, counts as 2^8. */
 ALWAYS_INLINE int32_t phase_cell_dividend(int32_t units) {
     return fixed_saturate_bits(units, PHASE_CELL_RISE_BITS) * (1 << 5);
 }
@@ -102,7 +102,7 @@ ALWAYS_INLINE int32_t phase_cell_u_q13(const phase_cell_t *cell, int32_t current
                                         PHASE_CELL_BITS);
 }
 
-/* middle + x (rise + x curvature), x in Q2.13, rounded to 8 units. */
+/* middle + x (rise + x curvature), x in Q2.13, both products rounded to 8 units: within 4 + 4 |x| units. */
 ALWAYS_INLINE int32_t phase_cell_evaluate(int32_t middle, int32_t rise, int32_t curvature, int32_t x_q13) {
     const int32_t x_q29 = x_q13 * (1 << 16);
     const int32_t slope = rise + 8 * fixed_multiply_high(curvature, x_q29);

@@ -16,6 +16,7 @@ extern "C" {
 
 #include "support/fixed_point.h"
 #include "support/phase_map_results.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -195,7 +196,7 @@ TEST(PhaseCell, flux_linkage_and_v_are_inverse_within_16_units_and_the_resolutio
         const phase_cell_t cell = cell_at(uint32_t(random()) >> 1, int32_t(random() % COLUMN_END));
         const auto v_q13 = int32_t(random() % 32766) - 16383;
         const int32_t flux = phase_cell_flux(&cell, v_q13);
-        ASSERT_NEAR(flux, cell.flux.middle + cell.flux.rise * (v_q13 / Q13), 5.0);
+        ASSERT_NEAR(flux, cell.flux.middle + cell.flux.rise * (v_q13 / Q13), 4.001);
         worst = std::max(worst, std::fabs(phase_cell_v_q13(&cell, flux) - double(v_q13)));
     }
     // The rise is rounded to 2^8 units.
@@ -281,6 +282,32 @@ TEST(PhaseCell, tables_of_extreme_entries_and_any_target_overflow_nothing) {
     }
     EXPECT_LT(largest, 1 << 30);
     EXPECT_GT(largest, 1 << 28);
+}
+
+TEST(PhaseCell, a_curve_is_evaluated_with_products_rounded_to_8_units_for_any_curve) {
+    using wide_integer::any_up_to;
+    std::mt19937 random(6);
+    double worst_of_bound = 0.0;
+    for (int i = 0; i < 200000; i++) {
+        const int32_t middle = any_up_to(random, 1 << 30) - (1 << 29);
+        const int32_t rise = any_up_to(random, 1 << 26) - (1 << 25);
+        const int32_t curvature = any_up_to(random, 1 << 25) - (1 << 24);
+        const int32_t x_q13 = any_up_to(random, 65535) - 32768;
+        const double x = x_q13 / Q13, exact = middle + x * (rise + x * curvature);
+        const double error = std::fabs(phase_cell_evaluate(middle, rise, curvature, x_q13) - exact);
+        const double bound = 4.0 + 4.0 * std::fabs(x);
+        ASSERT_LE(error, bound + 0.001) << middle << " " << rise << " " << curvature << " " << x_q13;
+        worst_of_bound = std::max(worst_of_bound, error / bound);
+    }
+    EXPECT_GT(worst_of_bound, 0.8);
+}
+
+TEST(PhaseCell, a_divisor_is_the_rise_rounded_to_an_odd_multiple_of_256_units) {
+    for (int32_t rise = -128; rise <= 1 << 25; rise += 1 + rise / 4096) {
+        const int32_t divisor = phase_cell_divisor(rise);
+        ASSERT_EQ(divisor % 2, 1) << rise;
+        ASSERT_LE(std::abs(divisor * 256 - rise), 384) << rise;
+    }
 }
 
 } // namespace
