@@ -88,8 +88,9 @@ typedef struct {
 /* Current setpoints of a machine for a crossover angle of 2^31..2^32 - 1, 2^-32 electrical rev. */
 pwm_ditc_setpoints_t pwm_ditc_setpoints(const machine_tables_t *tables, uint32_t crossover_angle);
 
-/* Current setpoint in A, Q7.9, for a torque in N m, Q7.24; interpolated linearly, rounded down. A negative torque, as
- * only a constant in a faulty memory makes it, is 0. */
+/* Current setpoint in A, Q7.9, for a torque in N m, Q7.24; interpolated linearly, the place between two entries
+ * to 2^-14 and the current to 1 LSB, both rounded down. A negative torque, as only a constant in a faulty memory makes
+ * it, is 0. */
 int32_t pwm_ditc_setpoint_q9(const pwm_ditc_setpoints_t *setpoints, int32_t torque_q24);
 
 /* Sets the values of the reference point of parameters that are complete otherwise: half of the current limit at an

@@ -15,6 +15,7 @@ extern "C" {
 #include "support/commutation_roles.h"
 #include "support/fixed_point.h"
 #include "support/phase_map_results.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -361,6 +362,31 @@ TEST(PwmDitcSetpoints, of_a_negative_torque_is_that_of_none) {
     EXPECT_GT(pwm_ditc_setpoint_q9(&setpoints, 1 << 24), 0);
 }
 
+TEST(PwmDitcSetpoints, are_interpolated_and_rounded_down_for_any_torque_and_currents) {
+    std::mt19937 random(9);
+    for (int table = 0; table < 50; table++) {
+        pwm_ditc_setpoints_t setpoints{};
+        for (unsigned k = 1; k < PWM_DITC_SETPOINTS; k++) {
+            setpoints.current_q9[k] = uint16_t(setpoints.current_q9[k - 1] + random() % 1400);
+        }
+        for (int i = 0; i < 4000; i++) {
+            const int32_t torque_q24 = wide_integer::any_up_to(random, INT32_MAX);
+            // Four entries for each doubling of the torque and 1/16 N m.
+            const double shifted = torque_q24 / Q24 * 16.0 + 1.0;
+            const auto at = [](unsigned k) { return (1.0 + k % 4 / 4.0) * std::exp2(k / 4); };
+            unsigned k = 0;
+            while (at(k + 1) <= shifted) {
+                k++;
+            }
+            const double low_q9 = setpoints.current_q9[k], rise_q9 = setpoints.current_q9[k + 1] - low_q9;
+            const double exact_q9 = low_q9 + rise_q9 * (shifted - at(k)) / (at(k + 1) - at(k));
+            const int32_t setpoint_q9 = pwm_ditc_setpoint_q9(&setpoints, torque_q24);
+            ASSERT_LE(setpoint_q9, exact_q9) << torque_q24;
+            ASSERT_GT(setpoint_q9, exact_q9 - 1.0 - rise_q9 / std::exp2(14)) << torque_q24;
+        }
+    }
+}
+
 TEST(PwmDitcSetpoints, are_the_currents_of_the_phase_map_within_2_percent_and_small_ones_within_a_third_of_an_ampere) {
     for (const double angle_deg : {180.0, 210.0, 255.0, 300.0}) {
         const pwm_ditc_setpoints_t setpoints = pwm_ditc_setpoints(&machine_tables, electrical_angle(angle_deg));
@@ -408,6 +434,30 @@ TEST_F(PwmDitc,
     EXPECT_EQ(ditc.regulated, 1u);
     EXPECT_NEAR(duty_q15[1], incoming_q15, 100);
     EXPECT_EQ(duty_q15[0], -ONE_Q15);
+}
+
+TEST_F(PwmDitc, the_ceiling_of_the_duty_is_rounded_to_nearest) {
+    const roles_t commutation = commutation_of(320.0);
+    std::fill_n(parameters.pid.scale_q28, BP_OUTPUTS, 0);
+    bp_tuner_reset(&parameters.pid, &tuner);
+    parameters.ceiling_gain_q24 = (1 << 24) / 60; // so that the ceiling is within the duties
+    std::mt19937 random(10);
+    int within = 0;
+    for (int i = 0; i < 20000; i++) {
+        pwm_ditc_reset(&ditc);
+        ditc.regulated = commutation.outgoing;
+        bp_pid_preset(&ditc.pid, ONE_Q15);
+        current_q9[0] = int32_t(random() % (LIMIT_Q9 + 1));
+        current_q9[1] = current_q9[2] = 0;
+        const int32_t acting_q15 = duty_q15[0] = int32_t(random() % 65537) - ONE_Q15;
+        step(commutation, 100.0);
+        const wide_integer::wide_t room_q9 = parameters.current_ceiling_q9 - current_q9[0];
+        const auto ceiling_q15 = wide_integer::nearest(room_q9 * parameters.ceiling_gain_q24, 1 << 18) - acting_q15;
+        const int32_t expected_q15 = std::clamp(int32_t(ceiling_q15), -ONE_Q15, ONE_Q15);
+        ASSERT_EQ(duty_q15[0], expected_q15) << current_q9[0] << " " << acting_q15;
+        within += std::abs(expected_q15) < ONE_Q15;
+    }
+    EXPECT_GT(within, 5000);
 }
 
 TEST_F(PwmDitc, a_phase_above_the_current_limit_is_never_driven) {
