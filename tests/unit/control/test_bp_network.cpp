@@ -7,9 +7,11 @@
 
 extern "C" {
 #include "control/bp_network.h"
+#include "fixed/sigmoid.h"
 }
 
 #include "support/reference_models.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -150,6 +152,96 @@ TEST(BpNetwork, outputs_equal_the_reference_model_for_small_and_for_saturated_we
         EXPECT_LT(worst, limit < 1.0 ? 4e-5 : limit < 3.0 ? 1.5e-4 : 2.5e-3);
         EXPECT_GT(worst, 2e-5);
     }
+}
+
+// Each product of a sum is rounded to its format: half an LSB. The sums are seen through the activation function, which
+// takes multiples of 2^-16.
+TEST(BpNetwork, sums_of_a_layer_err_by_half_an_lsb_for_each_product) {
+    std::mt19937 random(4);
+    int seen = 0;
+    for (int run = 0; run < 20000; run++) {
+        bp_network_t network{};
+        random_weights(network, random, run % 2 ? 2.6 : 8.0);
+        const int32_t input_q27[BP_INPUTS] = {any_q27(random), any_q27(random), any_q27(random)};
+        bp_network_forward(&network, input_q27);
+        const auto expect = [&](int32_t activation_q27, double sum, double error_q23) {
+            const auto low_q23 = int32_t(std::floor(sum * Q23 - error_q23));
+            const auto high_q23 = int32_t(std::ceil(sum * Q23 + error_q23));
+            ASSERT_GE(activation_q27, sigmoid_symmetric_q27(low_q23)) << run;
+            ASSERT_LE(activation_q27, sigmoid_symmetric_q27(high_q23)) << run;
+            seen += sigmoid_symmetric_q27(low_q23) == sigmoid_symmetric_q27(high_q23);
+        };
+        double output_sum[BP_OUTPUTS] = {};
+        for (const bp_neuron_t &neuron : network.hidden) {
+            double sum = 0.0;
+            for (unsigned k = 0; k < 3; k++) {
+                sum += neuron.input.value[k] / Q28 * (input_q27[k] / Q27);
+                output_sum[k] += neuron.output.value[k] / Q28 * (neuron.activation_q27 / Q27);
+            }
+            ASSERT_NO_FATAL_FAILURE(expect(neuron.activation_q27, sum, 3 * 0.5));
+        }
+        for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+            ASSERT_NO_FATAL_FAILURE(expect(network.output_q27[l], output_sum[l], 6 * 0.5));
+        }
+    }
+    EXPECT_GT(seen, 100000) << "where an error of less than 2^-16 would show";
+}
+
+// For the slopes of the activation functions as the firmware has them. An increment is the sum of two products, each
+// rounded to its LSB, of which the error's share (1.5 LSB of eta d3 in Q32, 2.4 of eta d2 in Q28) adds less than one.
+TEST(BpNetwork, increments_of_a_learning_step_err_by_their_roundings) {
+    std::mt19937 random(5);
+    double worst_output = 0.0, worst_hidden = 0.0;
+    for (int run = 0; run < 20000; run++) {
+        const bp_network_parameters_t parameters = {.learning_rate_q15 = int32_t(random() % 32769),
+                                                    .momentum_q32 = int32_t(random() % (1u << 31))};
+        bp_network_t network{};
+        random_weights(network, random, 8.0);
+        for (bp_neuron_t &neuron : network.hidden) {
+            for (unsigned k = 0; k < 3; k++) {
+                neuron.input.increment[k] = int32_t(random() % (1u << 27)) - (1 << 26);
+                neuron.output.increment[k] = int32_t(random() % (1u << 27)) - (1 << 26);
+            }
+        }
+        const int32_t input_q31[BP_INPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
+        const int32_t input_q27[BP_INPUTS] = {input_q31[0] / 16, input_q31[1] / 16, input_q31[2] / 16};
+        const int32_t sensitivity_q31[BP_OUTPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
+        const int32_t error_q16 = any_q15(random) * 2;
+        bp_network_forward(&network, input_q27);
+        const bp_network_t before = network;
+        bp_network_learn(&parameters, &network, error_q16, input_q31, sensitivity_q31);
+        const double momentum = parameters.momentum_q32 / Q32;
+        double delta[BP_OUTPUTS]; // eta d3
+        for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+            delta[l] = parameters.learning_rate_q15 / Q15 * (error_q16 / Q16) * (sensitivity_q31[l] / Q31) *
+                       (sigmoid_logistic_slope_q33(before.output_q27[l]) / (2.0 * Q32));
+        }
+        for (unsigned i = 0; i < BP_HIDDEN; i++) {
+            const bp_neuron_t &from = before.hidden[i], &to = network.hidden[i];
+            double back = 0.0;
+            for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+                back += delta[l] * (from.output.value[l] / Q28);
+            }
+            const double rate = back * (sigmoid_symmetric_slope_q32(from.activation_q27) / Q32);
+            for (unsigned k = 0; k < 3; k++) {
+                const double output = momentum * from.output.increment[k] + delta[k] * from.activation_q27;
+                const double hidden = momentum * from.input.increment[k] + rate * (input_q31[k] / Q31) * Q27;
+                const double output_error = std::fabs(to.output.increment[k] - output);
+                const double hidden_error = std::fabs(to.input.increment[k] - hidden);
+                ASSERT_LE(output_error, 1.1) << run << " " << i << " " << k;
+                ASSERT_LE(hidden_error, 2.3) << run << " " << i << " " << k;
+                worst_output = std::max(worst_output, output_error);
+                worst_hidden = std::max(worst_hidden, hidden_error);
+                const auto moved = [](int32_t value, int32_t increment) {
+                    return wide_integer::saturated(wide_integer::wide_t(value) + 2 * wide_integer::wide_t(increment));
+                };
+                ASSERT_EQ(to.output.value[k], moved(from.output.value[k], to.output.increment[k]));
+                ASSERT_EQ(to.input.value[k], moved(from.input.value[k], to.input.increment[k]));
+            }
+        }
+    }
+    EXPECT_GT(worst_output, 0.9);
+    EXPECT_GT(worst_hidden, 0.9);
 }
 
 TEST(BpNetwork, a_learning_step_changes_the_weights_as_the_reference_model_does) {
