@@ -85,7 +85,7 @@ bool slow_counts_step(const slow_counts_parameters_t *parameters, slow_counts_t 
                       uint32_t angle, uint32_t periods);
 
 /* Gains of the coming samples, while counts are slow. slope_q24: K in N m per 0.02 rad, Q7.24. Products of 64 bits,
- * rounded down; up to four 32-bit divisions when no count changed for 4 ms. */
+ * rounded to 2 LSB, by the slope's factor down; up to four 32-bit divisions when no count changed for 4 ms. */
 void slow_counts_update(const slow_counts_parameters_t *parameters, slow_counts_t *counts, int32_t slope_q24);
 
 /* All results but `slow`. */

@@ -90,6 +90,29 @@ TEST_F(SlowCounts, have_the_gains_of_samples_that_far_apart) {
     EXPECT_GT(speed_gain(results.edge), 0.0);
 }
 
+// Each product is rounded to 2 LSB: within 1 LSB, of which the next one keeps its factor's part.
+TEST_F(SlowCounts, have_gains_within_the_rounding_of_their_products) {
+    for (const uint32_t rate_hz : {20000u, 40000u, 100000u}) {
+        const slow_counts_parameters_t p = slow_counts_configure(rate_hz, BITS, INERTIA_Q30);
+        const double l2 = p.deadbeat.speed_gain_q24, l3 = p.deadbeat.load_gain_q28;
+        for (uint32_t periods = 1; periods < 8 * p.deadbeat_periods; periods++) {
+            counts.interval = counts.periods = periods - 1;
+            slow_counts_update(&p, &counts, 0);
+            const load_observer_gains_t &edge = counts.edge;
+            if (periods <= p.deadbeat_periods) {
+                const double x = periods * p.step_q31 / Q31, q = INT32_MAX / Q31 - x;
+                ASSERT_NEAR(edge.angle_gain_q28, Q28 * (1.0 - q * q * q), 1.3) << periods;
+                ASSERT_NEAR(edge.speed_gain_q24, l2 * (1.0 - q * q), 1.0 + 2.0 * std::fabs(l2) / Q31) << periods;
+                ASSERT_NEAR(edge.load_gain_q28, l3 * x / 2.0, 1.0 + 0.5 * std::fabs(l3) / Q31 + 1e-3) << periods;
+            } else {
+                const double y = double((p.deadbeat_periods << 16) / periods) / Q16;
+                ASSERT_NEAR(edge.speed_gain_q24, l2 * y, 1.0 + 1e-3) << periods;
+                ASSERT_NEAR(edge.load_gain_q28, l3 * y * y / 2.0, 1.0 + 0.5 + 1e-3) << periods;
+            }
+        }
+    }
+}
+
 TEST_F(SlowCounts, tell_the_edge_when_they_change_and_an_interval_when_not) {
     wait(100, 5 * COUNT);
     load_observer_t observer = {};
