@@ -20,7 +20,7 @@ Generated from `storage/parameters.def` by `python -m salient.generate.parameter
 
 The index addresses a parameter over CAN (`comms/drive.dbc`); the raw value has an LSB of 2^-(fraction bits) of the
 unit. Parameters are read with PARAMETER_REQUEST, and changed as a set that is applied as a whole
-([README.md](README.md#a-set-of-parameters-in-raw-frames)). *In run*: may be changed in state run, without a step of the
+([comms/README.md](comms/README.md#a-set-of-parameters)). *In run*: may be changed in state run, without a step of the
 law's state; the others outside of it only. Angles are electrical degrees of the phase: 180 is the unaligned, 360 the
 aligned position. (traditional, paper, salient): used by these controllers only.
 
