@@ -1,62 +1,40 @@
-"""Runs a drive at 600 r/min, for two seconds by default, then switches it off.
-
-    tools/salient sim --can unix:/tmp/salient.sock                                     in one terminal
-    build/venv/bin/python tools/examples/run_600_rpm.py [unix:PATH [SECONDS]]          in another
-
-Raw frames: commands to run every 10 ms of the drive's time, which is the time stamp of the frames; the drive takes them
-as off until it is armed by a request and the response to its challenge. When no valid command arrives for 50 ms in the
-state run the torque ramps to zero, and after 500 ms the drive trips with command_timeout.
-"""
-
+"""Arms a drive, runs it at 600 r/min for two seconds by default, and stops it: firmware/comms/README.md in Python.
+    tools/salient sim --can unix:/tmp/salient.sock                                         in one terminal
+    build/venv/bin/python tools/examples/run_600_rpm.py [unix:PATH|INTERFACE [SECONDS]]    in another"""
+import binascii
 import sys
+from pathlib import Path
 
 import can
+import cantools
 
-from salient.bench.arming import arm_frame, response_to
-from salient.bench.drive import command_frame
-from salient.bus.interface import wait_until_ready
-from salient.bus.signals import drive_database
+DRIVE = cantools.database.load_file(Path(__file__).resolve().parents[2] / "firmware" / "comms" / "drive.dbc")
+HEARD = [{"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in (0x180, 0x181, 0x18E)]
 
-SPEED_RPM = 600.0
-COMMAND_PERIOD_S = 0.01
+def protected(name: str, counter: int, **signals: object) -> can.Message:
+    message = DRIVE.get_message_by_name(name)
+    covered = message.encode({"checksum": 0, "counter": counter % 256, **signals})[2:]
+    data_id = message.dbc.attributes["E2EDataId"].value.to_bytes(2, "little")
+    data = binascii.crc_hqx(covered + data_id, 0xFFFF).to_bytes(2, "little") + covered
+    return can.Message(arbitration_id=message.frame_id, is_extended_id=False, data=data)
 
-
-def main(channel: str = "unix:/tmp/salient.sock", duration_s: str = "2.0") -> None:
-    status, motion, arming = (drive_database().get_message_by_name(name)
-                              for name in ("DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_ARMING"))
-    wait_until_ready(channel)
-    with can.Bus(interface="salient", channel=channel) as bus:
-        start_s, counter, speed_rpm = None, 0, 0.0
-        for message in bus:
-            if message.arbitration_id == motion.frame_id and not message.is_extended_id:
-                speed_rpm = motion.decode(message.data)["speed_rpm"]
-            if message.arbitration_id == arming.frame_id and not message.is_extended_id:
-                report = arming.decode(message.data)
-                if report["attempt"] == "run":
-                    bus.send(arm_frame(1, "confirm_run", response_to(report["challenge"])))
-            start_s = message.timestamp if start_s is None else start_s
-            elapsed_s = message.timestamp - start_s
-            if elapsed_s >= float(duration_s):
-                break
-            if elapsed_s >= counter * COMMAND_PERIOD_S:
-                bus.send(command_frame(counter % 256, "run", SPEED_RPM))
-                if counter == 0:
-                    bus.send(arm_frame(0, "request_run"))
-                counter += 1
-                if counter % 20 == 0:
-                    print(f"{elapsed_s:.2f} s  {speed_rpm:.1f} r/min")
-        bus.send(command_frame(counter % 256, "off", 0.0))
-        # A client that disconnects with unread frames can lose what it sent last: wait for the effect.
-        for message in bus:
-            if message.arbitration_id == status.frame_id and not message.is_extended_id:
-                state = status.decode(message.data)["state"]
-                if state != "run":
-                    print(f"state {state}")
-                    break
-
-
-if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:])
-    except can.CanError as error:
-        sys.exit(str(error))
+channel, duration_s = sys.argv[1:] + ["unix:/tmp/salient.sock", "2.0"][len(sys.argv) - 1:]
+start_us, sent, request, shown = None, 0, "run", {"state": "run", "speed_rpm": 0.0}
+try:
+    with can.Bus(channel, "salient" if channel.startswith("unix:") else "socketcan", can_filters=HEARD) as bus:
+        while request == "run" or shown["state"] == "run":
+            shown |= DRIVE.decode_message((message := bus.recv()).arbitration_id, message.data)
+            start_us = shown.get("time_us") if start_us is None else start_us  # of the drive, whatever its pace
+            if message.arbitration_id == 0x18E and request == "run" and shown["armed"] == "no":
+                answer = {"step": "confirm_run", "response": shown["challenge"] ^ 0xFFFFFFFF}
+                arm = answer if shown["attempt"] == "run" else {"step": "request_run", "response": 0}
+                bus.send(protected("DRIVE_ARM", int(arm is answer), **arm))
+            elif start_us is not None and (time_s := (shown["time_us"] - start_us) % 2**32 / 1e6) >= 0.01 * sent:
+                request = "run" if time_s < float(duration_s) else "stop"
+                bus.send(protected("DRIVE_COMMAND", sent, request=request, speed_reference_rpm=600))
+                sent += 1
+                if sent % 20 == 0:
+                    print(f"{time_s:.2f} s  {shown['speed_rpm']:.1f} r/min")
+    print("state", shown["state"])
+except (can.CanError, OSError) as error:
+    sys.exit(str(error))
