@@ -96,7 +96,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "view", "scope", "machine")
+WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine")
 """Commands that need no drive."""
 
 

@@ -39,7 +39,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
-        (["monitr"], ["no command monitr: the nearest of 18 are monitor, ", "tools/salient --help"]),
+        (["monitr"], ["no command monitr: the nearest of 19 are monitor, ", "tools/salient --help"]),
         (["fo'o"], ["no command fo'o: the nearest of "]),
         (["a\nb"], ["no command a b: the nearest of "]),
         (["--can", "unix:x", "sim"], ["unrecognised argument --can; must be one of --help, "]),

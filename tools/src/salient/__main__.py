@@ -111,6 +111,12 @@ def _monitor(options: argparse.Namespace) -> int:
     return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node)
 
 
+def _command(options: argparse.Namespace) -> int:
+    from salient.bench.shell import run
+
+    return run(options)
+
+
 def _view(options: argparse.Namespace) -> int:
     from salient.view.command import run
 
@@ -190,6 +196,7 @@ _COMMANDS = {
     "run": _run,
     "log": _log,
     "monitor": _monitor,
+    "command": _command,
     "campaign": _campaign,
     "replay": _replay,
     "view": _view,

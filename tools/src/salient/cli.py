@@ -125,6 +125,27 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     _add_machine(monitor)
     _add_node(monitor)
 
+    commands_from_shell = command("command", "command a running drive and its test bench from a shell")
+    actions = commands_from_shell.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
+    for name, metavar, text in (
+            ("speed", "RPM", "arm the drive and run it at a speed, then stop it: after --duration-s or by Ctrl-C (a "
+             "second one opens the switches at once)"),
+            ("torque", "NM", "likewise with a torque"),
+            ("load", "NM", "set the load torque of the test bench"),
+            ("stop", None, "ramp the drive to zero, in the place of the command that runs it"),
+            ("clear", None, "clear a fault"),
+            ("arm", None, "arm the drive and let it be, to see that it can be armed; speed and torque do it by "
+             "themselves")):
+        action = actions.add_parser(name, help=text, description=text, prog=f"{COMMAND} command {name}")
+        if metavar is not None:
+            action.add_argument("value", type=_finite, metavar=metavar)
+        if name in ("speed", "torque"):
+            action.add_argument("--duration-s", type=_positive, metavar="X",
+                                help="virtual time after which it stops the drive (default: when interrupted)")
+        _add_can(action)
+        _add_machine(action)
+        _add_node(action)
+
     view = command("view", "the live page of a running drive, or of a log, in a browser; prints its link")
     shown = view.add_mutually_exclusive_group()
     _add_can(shown)
@@ -377,6 +398,13 @@ def _positive(text: str) -> float:
     value = _number(text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
+    return value
+
+
+def _finite(text: str) -> float:
+    value = _number(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a number")
     return value
 
 

@@ -159,6 +159,10 @@ class Drive(KnownAttributes):
         self.ask("off")
         self.ask("clear_fault")
 
+    def continue_from(self, counter: int) -> None:
+        """The next command follows one with this counter, 0..255: in the place of another sender."""
+        self._counter = (counter + 1) % 256
+
     def silence(self) -> None:
         """Send no more commands until the next request."""
         self.command_due_ns = None

@@ -91,7 +91,8 @@ class Session(KnownAttributes):
     telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
-    session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name.
+    session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name, all
+    frames or, with signals=LatestSignals, the latest: for a session of any length, whose owner clears log and sent.
     """
 
     address: str
@@ -112,7 +113,8 @@ class Session(KnownAttributes):
     def __init__(self, address: str, lockstep: bool = True,  # noqa: PLR0913, PLR0917 - each has a default
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
                  is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
-                 node: int = 0, drives: int = 1, silence_max_s: float = math.inf) -> None:
+                 node: int = 0, drives: int = 1, silence_max_s: float = math.inf,
+                 signals: type[SignalTable] = SignalTable) -> None:
         self.address = address
         self.machine = machine
         self.nodes = range(node, node + drives)
@@ -120,8 +122,8 @@ class Session(KnownAttributes):
         self.log = []
         self.sent = []
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
-        self.telemetry = SignalTable(self.drive_database, "DRIVE")
-        self.truth = SignalTable(self.rig_database, "RIG")
+        self.telemetry = signals(self.drive_database, "DRIVE")
+        self.truth = signals(self.rig_database, "RIG")
         clients: list[Client] = [self]
         clients += [_DriveOfSeveral(self, machine, node + number) for number in range(1, drives)]
         self.drives = [Drive(client, parameter_table) for client in clients]

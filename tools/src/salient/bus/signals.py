@@ -168,6 +168,34 @@ class SignalTable(Mapping[str, Signal]):
         raise no_message(message_name, self._messages.values())
 
 
+class LatestSignals(SignalTable):
+    """The latest frame of each message: for what runs for days."""
+
+    def __init__(self, database: Database, sender: str) -> None:
+        super().__init__(database, sender)
+        self._latest: dict[tuple[int, bool], tuple[int, bytearray]] = {}
+        self._counts = dict.fromkeys(self._length, 0)
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        key = (message.arbitration_id, message.is_extended_id)
+        if self._length.get(key) != len(message.data) or message.is_remote_frame or message.is_error_frame:
+            return
+        self._latest[key] = (time_ns, message.data)
+        self._counts[key] += 1
+
+    def __getitem__(self, name: str) -> Signal:
+        if name in self._names and (key := self._names[name][0]) in self._latest:
+            time_ns, data = self._latest[key]
+            self._times[key], self._data[key] = array("q", [time_ns]), data.ljust(8, b"\0")
+        return super().__getitem__(name)
+
+    def count(self, message_name: str) -> int:
+        for key, message in self._messages.items():
+            if message.name == message_name:
+                return self._counts[key]
+        raise no_message(message_name, self._messages.values())
+
+
 def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
     """Physical values of a little-endian signal from frames as 64-bit words."""
     field = _raw(raw, signal)

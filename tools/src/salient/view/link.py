@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from array import array
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
@@ -16,7 +15,7 @@ from cantools.database.can import Database
 from salient.bench.drive import Drive, DriveError, OtherDatabase
 from salient.bench.rig import Rig, RigError
 from salient.bus.clock import VirtualTimeReader, open_bus
-from salient.bus.signals import SignalTable, drive_database, no_message, rig_database
+from salient.bus.signals import LatestSignals, SignalTable, drive_database, rig_database
 from salient.dbc import database_hash
 from salient.view.frames import Chunk, FrameStore
 
@@ -30,34 +29,6 @@ SHOWN_WITHIN_NS = 1_000_000_000
 
 class LinkClosed(Exception):
     """The bus has ended."""
-
-
-class LatestSignals(SignalTable):
-    """The latest frame of each message: a server runs for days."""
-
-    def __init__(self, database: Database, sender: str) -> None:
-        super().__init__(database, sender)
-        self._latest: dict[tuple[int, bool], tuple[int, bytearray]] = {}
-        self._counts = dict.fromkeys(self._length, 0)
-
-    def add(self, time_ns: int, message: can.Message) -> None:
-        key = (message.arbitration_id, message.is_extended_id)
-        if self._length.get(key) != len(message.data) or message.is_remote_frame or message.is_error_frame:
-            return
-        self._latest[key] = (time_ns, message.data)
-        self._counts[key] += 1
-
-    def __getitem__(self, name: str) -> Any:
-        if name in self._names and (key := self._names[name][0]) in self._latest:
-            time_ns, data = self._latest[key]
-            self._times[key], self._data[key] = array("q", [time_ns]), data.ljust(8, b"\0")
-        return super().__getitem__(name)
-
-    def count(self, message_name: str) -> int:
-        for key, message in self._messages.items():
-            if message.name == message_name:
-                return self._counts[key]
-        raise no_message(message_name, self._messages.values())
 
 
 class DriveTime:
