@@ -20,7 +20,7 @@ from salient.machine.drive_data import derive
 from salient.machine.file import Machine, MachineError, load_machine, machine_path
 from salient.machine.magnetics import Formula
 from salient.machine.parameter_table import read_table
-from salient.paths import BUILD
+from salient.paths import BUILD, EXAMPLE_MACHINES
 
 SEED = 20
 LINE_MAX = 600  # characters of a rejection without the path
@@ -462,6 +462,15 @@ def test_unreadable_file_is_rejected(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(10_000_000_000)  # takes no space
     assert "larger than" in rejection(path)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLE_MACHINES.glob("*.toml")))
+def test_machines_of_the_examples_have_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert machine_path(name) == EXAMPLE_MACHINES / f"{name}.toml"
+    assert load_machine(machine_path(name)).name == name
+    with pytest.raises(MachineError, match=r"no bundled machine of that name.*\bfan12\b"):
+        machine_path(f"{name}_")
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "x" * 5000, "a\nb", "a\0b", "pipe", "itself"])

@@ -17,6 +17,7 @@ BUILD = (Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
 COMMAND = "salient" if IS_WHEEL else "tools/salient"
 PYTHON_PACKAGES = ROOT / "tools" / "requirements.lock"
 MACHINES = ROOT / "tools" / "machines"
+EXAMPLE_MACHINES = ROOT / "tools" / "examples" / "machines"
 LOADS = ROOT / "tools" / "loads"
 SCENARIOS = ROOT / "tools" / "scenarios"
 DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
@@ -43,18 +44,19 @@ def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
         raise cannot_write(f"--out {out}", error) from None
 
 
-def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str) -> Path:
-    """The file meant by the name of a bundled one in a folder, or by a path; UsageError, which begins with the key,
-    when there is none."""
-    bundled, path = folder / f"{name_or_path}{suffix}", Path(name_or_path)
+def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str, *more: Path) -> Path:
+    """The file meant by the name of a bundled one in a folder, the first of several, or by a path; UsageError, which
+    begins with the key, when there is none."""
+    folders, path = (folder, *more), Path(name_or_path)
     try:
-        if bundled.is_file():
-            return bundled
+        for bundled in (each / f"{name_or_path}{suffix}" for each in folders):
+            if bundled.is_file():
+                return bundled
         if path.is_file():
             return path.resolve()
     except OSError:
         pass  # a name too long for a file: there is none
-    names = sorted(p.stem for p in folder.glob(f"*{suffix}"))
+    names = sorted(p.stem for each in folders for p in each.glob(f"*{suffix}"))
     raise UsageError(f"{key} {shown(name_or_path)}: no such file, and no bundled {key.replace('_', ' ')} of that name; "
                      f"{close_names(path.stem, names)}")
 

@@ -1,4 +1,4 @@
-"""Names of machines: the bundled ones, and files of the user.
+"""Names of machines: the bundled ones, those of the examples, and files of the user.
 
 Standard library only: a machine whose image is in the cache starts without NumPy and pydantic, which take longer to
 import than the drive to start.
@@ -12,7 +12,7 @@ from typing import Any
 
 from salient.config import CONDITIONS
 from salient.errors import UsageError
-from salient.paths import MACHINES, bundled_or_path
+from salient.paths import EXAMPLE_MACHINES, MACHINES, bundled_or_path
 
 
 class MachineError(UsageError, ValueError):
@@ -20,9 +20,10 @@ class MachineError(UsageError, ValueError):
 
 
 def machine_path(name_or_path: str) -> Path:
-    """The file meant by the name of a bundled machine or by a path; MachineError when there is none."""
+    """The file meant by the name of a machine, bundled or of the examples, or by a path; MachineError when there is
+    none."""
     try:
-        return bundled_or_path(name_or_path, MACHINES, ".toml", "machine")
+        return bundled_or_path(name_or_path, MACHINES, ".toml", "machine", EXAMPLE_MACHINES)
     except UsageError as error:
         raise MachineError(str(error)) from None
 
