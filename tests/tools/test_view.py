@@ -24,6 +24,7 @@ from websockets.sync.client import connect
 
 from salient.bench import failure
 from salient.bench.drive import DriveError
+from salient.bus.identity import Carrier
 from salient.bus.log import write_logs
 from salient.bus.signals import drive_database, rig_database
 from salient.paths import BUILD, ROOT
@@ -488,7 +489,7 @@ def test_a_log_alone_has_what_was_done(bench, tmp_path):
     bench.fault("winding_open", phase="b")
     bench.run_for(0.02)
     write_logs(bench.log, tmp_path / "can.blf")
-    found = LogFeed(tmp_path / "can.blf", str(bench.options.machine), 0).info["stimuli"]
+    found = LogFeed(tmp_path / "can.blf", Carrier("can.blf", str(bench.options.machine)), 0).info["stimuli"]
     assert [act["text"] for act in found] == ["run in speed mode, speed_reference_rpm = 300 r/min",
                                               "fault winding_open begins, phase b"]
     assert [act["time_s"] for act in found] == pytest.approx([0.0, 0.05], abs=1e-3)
@@ -519,9 +520,10 @@ def test_another_dbc_than_that_of_the_drive_is_said_and_no_reference_sent(browse
                                      ROOT / "tools/examples/machines/fan12.toml"), live.bench)
     live.bench.run_for(0.2)
     visitor.catch_up()
-    visitor.wait("document.getElementById('notice').textContent.includes('another drive.dbc')")
+    visitor.wait("document.getElementById('notice').textContent.includes('another machine than fan12')")
     visitor.take_command()
     visitor.press("#speed-form button")
+    assert "the drive carries saturating" in visitor.notice()
     assert "a reference would be another one" in visitor.notice()
     visitor.run(0.1)
     assert live.bench.drive.state == "ready"

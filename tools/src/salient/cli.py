@@ -153,7 +153,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                        help="instead: a log, FILE.blf, FILE.asc or FILE.log, or the folder of a failed test")
     _add_machine(view, "whose poles and signals are shown: ")
     _add_node(view)
-    view.set_defaults(machine=None, node=None)  # a failed test has noted them
+    view.set_defaults(node=None)  # a failed test has noted them
 
     tab = command("tab", "the live page with a drive inside, as one file for a browser: no installation, no server")
     tab.add_argument("--out", type=Path, default=Path("out/tab.html"), metavar="FILE",
@@ -265,8 +265,9 @@ def _add_bench_options(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def _add_machine(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    parser.add_argument("--machine", type=_option_type("machine"), default=DEFAULTS["machine"],
-                        metavar=OPTIONS["machine"].metavar, help=purpose + description("machine"))
+    option = OPTIONS["machine"]
+    parser.add_argument("--machine", type=_option_type("machine"), metavar=option.metavar,
+                        help=f"{purpose}{option.help}: {option.allowed} (default the one that the drive reports)")
 
 
 def _add_node(parser: argparse.ArgumentParser) -> None:

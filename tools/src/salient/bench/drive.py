@@ -16,6 +16,7 @@ from salient.bench.arming import ArmingSequence
 from salient.bench.client import Client, KnownAttributes
 from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
+from salient.bus.identity import OtherDatabase
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
 from salient.errors import RunFailed, UsageError, close_names
 
@@ -53,10 +54,6 @@ _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 class DriveError(RunFailed):
     """The drive rejected a request or did not respond; the message has the reason."""
-
-
-class OtherDatabase(DriveError, UsageError):
-    """A reference for a drive whose DBC is not that of the session: the drive would take it for another one."""
 
 
 class DriveNotReady(DriveError):

@@ -24,7 +24,7 @@ from salient.toml_file import TextFileError, read_toml
 def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
-                 silence_max_s=SILENCE_MAX_S) as session:
+                 silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
         match options.action:
             case "save":
                 return save(session, options.file)

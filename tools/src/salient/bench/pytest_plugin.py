@@ -171,7 +171,8 @@ class DriveOnBus(Session):
         def is_alive() -> bool:
             raise UsageError(f"--salient-can {can}: no frame for a second; is there a drive?")
 
-        super().__init__(can, lockstep=False, is_alive=is_alive, machine=machine, node=node)
+        super().__init__(can, lockstep=False, is_alive=is_alive, machine=machine, node=node,
+                         machine_option="--salient-machine")
         self._refuses_bench = True
 
     def release(self) -> None:

@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> int:
     """Reads the buffer of a running drive into a folder; returns the exit code."""
     make_folder(options.out, [TABLE, PLOT])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
-                 silence_max_s=SILENCE_MAX_S) as session:
+                 silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
         trace = session.drive.fault_trace()
         log = session.drive.fault_log.read()
     title = f"{log[-1].fault} in state {log[-1].state}" if log else "fault"

@@ -19,11 +19,11 @@ import can
 from cantools.database.can import Database
 
 from salient.bench.client import Client, KnownAttributes
-from salient.bench.drive import Drive, OtherDatabase, ParameterRow
+from salient.bench.drive import Drive, ParameterRow
 from salient.bench.rig import Fault, Rig
 from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bus
+from salient.bus.identity import IDENTITY_WAIT_NS, Carrier, OtherDatabase, hash_of
 from salient.bus.signals import SignalTable, drive_database, rig_database
-from salient.dbc import database_hash
 from salient.errors import RunFailed, UsageError, shown
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
@@ -37,10 +37,6 @@ _SOCKETCAN_STEP_NS = 10_000_000
 """Longest step on a SocketCAN interface: its socket loses frames that do not fit, and the end of the step with them."""
 
 _NO_STEP_NS = 1 << 62
-
-_IDENTITY_WAIT_NS = 250_000_000
-"""More than two periods of DRIVE_IDENTITY."""
-
 
 _TIME_MAX_S = 280_000.0
 """A time of RIG_RUN_UNTIL has 6 bytes: 281,474 s."""
@@ -84,8 +80,11 @@ class Session(KnownAttributes):
     emulator is seen on a local bus only. A session waits for the emulator for any wall time, as at a breakpoint, unless
     silence_max_s bounds that without a frame of the drive or the emulator; then SessionError.
 
-    machine: name or file of the drive's machine, whose DBC the session then uses; without it that in SI units. To a
-    drive that reports another DBC no reference is sent (OtherDatabase); its frames are decoded, after a warning.
+    machine: name or file of the drive's machine, whose DBC the session uses. Where time moves by itself, the session
+    begins with the drive's report of its DBC, if there is one within 250 ms: without a machine it is then the drive's,
+    and OtherDatabase when it is not known here, or is not the one that is given. In lock-step, where the report may
+    come 100 ms later, a session without a machine has the DBC in SI units, and one of another drive warns. To a drive
+    that reports another DBC no reference is sent (OtherDatabase). machine_option: how the user states the machine.
 
     node: the node number of the drive; drives: their number, with ascending node numbers from there: nodes. drive, rig,
     telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
@@ -114,41 +113,58 @@ class Session(KnownAttributes):
                  parameter_table: Callable[[], list[ParameterRow]] | None = None,
                  is_alive: Callable[[], bool] = lambda: True, machine: str | None = None,
                  node: int = 0, drives: int = 1, silence_max_s: float = math.inf,
-                 signals: type[SignalTable] = SignalTable) -> None:
+                 signals: type[SignalTable] = SignalTable, machine_option: str = "machine=") -> None:
         self.address = address
-        self.machine = machine
         self.nodes = range(node, node + drives)
         self.time_ns = 0
         self.log = []
         self.sent = []
-        self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
-        self.telemetry = signals(self.drive_database, "DRIVE")
-        self.truth = signals(self.rig_database, "RIG")
-        clients: list[Client] = [self]
-        clients += [_DriveOfSeveral(self, machine, node + number) for number in range(1, drives)]
-        self.drives = [Drive(client, parameter_table) for client in clients]
-        self.rigs = [Rig(client) for client in clients]
-        self.drive, self.rig = self.drives[0], self.rigs[0]
-        self._tables = [table for client in clients for table in (client.telemetry, client.truth)]
-        self._identity = self.drive_database.get_message_by_name("DRIVE_IDENTITY")
-        self._database_hash = database_hash(drive_database(machine))
+        self._carrier = Carrier(address, machine, node, option=machine_option)
+        self._identity_id = drive_database(None, node).get_message_by_name("DRIVE_IDENTITY").frame_id
+        self._tables: list[SignalTable] = []
+        self.drives = []
+        self._signals = signals
         self._lockstep = lockstep
         self._step_max_ns = _SOCKETCAN_STEP_NS // drives if address.startswith("socketcan:") else _NO_STEP_NS
         self._is_alive = is_alive
         self._silence_max_s = silence_max_s
         self._sequence = 0
-        self._identity_checked = False
         self._other_database = ""
         self._bus = open_bus(address)
         self._reader = VirtualTimeReader(self._bus)
         try:
+            if not lockstep:
+                self._await_identity()
+            self._use(self._carrier.machine or machine, parameter_table)
             if lockstep:
                 self._run_until(0)  # the answer has the present time
-            else:
-                self._receive()
         except BaseException:
             self.close()
             raise
+
+    def _await_identity(self) -> None:
+        """Receives until the drive has reported its DBC, or has not for IDENTITY_WAIT_NS. OtherDatabase: see above."""
+        begin_ns = None
+        while not self._carrier.take(self._receive()):
+            begin_ns = self.time_ns if begin_ns is None else begin_ns
+            if self.time_ns - begin_ns > IDENTITY_WAIT_NS:
+                return
+
+    def _use(self, machine: str | None, parameter_table: Callable[[], list[ParameterRow]] | None) -> None:
+        """Makes drives, benches and tables of the DBC of a machine; the tables have what was received before."""
+        self.machine = machine
+        node, *others = self.nodes
+        self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
+        self.telemetry = self._signals(self.drive_database, "DRIVE")
+        self.truth = self._signals(self.rig_database, "RIG")
+        clients: list[Client] = [self, *(_DriveOfSeveral(self, machine, other) for other in others)]
+        self.drives = [Drive(client, parameter_table) for client in clients]
+        self.rigs = [Rig(client) for client in clients]
+        self.drive, self.rig = self.drives[0], self.rigs[0]
+        self._tables = [table for client in clients for table in (client.telemetry, client.truth)]
+        for time_ns, message in self.log:
+            for table in self._tables:
+                table.add(time_ns, message)
 
     def close(self) -> None:
         """Leaves the bus."""
@@ -257,11 +273,11 @@ class Session(KnownAttributes):
         """OtherDatabase when the drive has reported another DBC than that of the session. Waits for its first report
         where time moves by itself; in lock-step time belongs to the caller, and the report may come up to 100 ms later.
         """
-        deadline_ns = self.time_ns + _IDENTITY_WAIT_NS
-        while not (self._lockstep or self._identity_checked) and self.time_ns < deadline_ns:
+        deadline_ns = self.time_ns + IDENTITY_WAIT_NS
+        while not (self._lockstep or self._carrier.machine or self._other_database) and self.time_ns < deadline_ns:
             self._receive()
         if self._other_database:
-            raise OtherDatabase(f"{self._other_database}: a reference would be another one; state the drive's machine")
+            raise OtherDatabase(f"{self._other_database}: a reference would be another one")
 
     def receive_until(self, matches: Callable[[can.Message], bool]) -> can.Message:
         """Receives until a frame matches; in lock-step virtual time does not pass."""
@@ -319,20 +335,23 @@ class Session(KnownAttributes):
         self.log.append(timed)
         for table in self._tables:
             table.add(time_ns, message)
-        if not self._identity_checked and message.arbitration_id == self._identity.frame_id:
+        if self._tables and message.arbitration_id == self._identity_id:
             self._check_identity(message)
         return message
 
     def _check_identity(self, message: can.Message) -> None:
-        """One line on stderr, once, when the drive was built from another DBC than that of the tools."""
-        if (message.is_extended_id or message.is_remote_frame or message.is_error_frame
-                or len(message.data) != self._identity.length):
+        """One line on stderr, once, when the drive's DBC is not that of the session."""
+        if self._other_database:
             return
-        self._identity_checked = True
-        identity = self._identity.decode_simple(bytes(message.data))
-        expected = self._database_hash
-        if identity["dbc_hash"] != expected:
-            version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
-            self._other_database = (f"{self.address}: firmware {version} was built from another drive.dbc "
-                                    f"(hash {identity['dbc_hash']:08x}, here {expected:08x})")
+        known = self._carrier.machine
+        try:
+            if not self._carrier.take(message) or self._carrier.machine == known:
+                return
+            carried = self._carrier.machine
+            if hash_of(carried) != hash_of(self.machine):
+                self._other_database = (f"{self.address}: the drive carries {carried}, this session has begun without "
+                                        "a machine: state it with machine=")
+        except OtherDatabase as error:
+            self._other_database = str(error)
+        if self._other_database:
             print(f"salient: {self._other_database}: signals may be decoded wrongly", file=sys.stderr)

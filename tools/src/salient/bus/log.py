@@ -126,16 +126,17 @@ def _asc_event(message: can.Message) -> str:
         channel=1, id=identifier, dir="Rx", dtype=f"{kind} {message.dlc:x}", data=data).rstrip()
 
 
-def open_log(path: Path, machine: str | None = None, node: int = 0) -> Log:
-    """A log file by its suffix. machine, node: those whose DBC decodes the frames of an MF4 file, by default in SI
-    units. UsageError: the suffix is none of LOG_SUFFIXES, or the file cannot be made."""
+def open_log(path: Path, machine: str | None = None, node: int = 0, source: str = "") -> Log:
+    """A log file by its suffix. machine, node: those whose DBC decodes the frames of an MF4 file, by default the
+    machine that the drive reports. source: of the frames, for messages. UsageError: the suffix is none of
+    LOG_SUFFIXES, or the file cannot be made."""
     if path.suffix not in LOG_SUFFIXES:
         raise UsageError(f"--out {path}: the suffix must be {either(LOG_SUFFIXES)}")
     try:
         if path.suffix == ".mf4":
             from salient.bus.mf4 import Mf4Log  # asammdf loads pandas: a second that only this format needs
 
-            return Mf4Log(path, machine, node)
+            return Mf4Log(path, machine, node, source or str(path))
         formats: dict[str, Callable[[Path], Log]] = {".blf": BlfLog, ".asc": AscLog, ".log": CandumpLog}
         return formats[path.suffix](path)
     except OSError as error:

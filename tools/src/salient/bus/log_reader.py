@@ -31,9 +31,9 @@ class _Truncated(Exception):
     """The end of a log is missing."""
 
 
-def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
+def convert(source: Path, target: Path, machine: str | None, node: int = 0) -> int:
     """Writes the frames of a log to another, whose suffix is the format; returns their number. UsageError: a file
-    cannot be read or written, or is truncated; then there is no target."""
+    cannot be read or written, or is truncated; OtherDatabase: see Carrier; then there is no target."""
     if source.resolve() == target.resolve():
         raise UsageError(f"--out {target}: must be another file than --convert {source}")
     frames = read_log(source)
@@ -42,7 +42,7 @@ def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
-    log = open_log(target, machine, node)
+    log = open_log(target, machine, node, str(source))
     count = 0
     try:
         while first is not None:
@@ -52,7 +52,7 @@ def convert(source: Path, target: Path, machine: str, node: int = 0) -> int:
         log.close()
     except UsageError:
         log.close()
-        target.unlink()
+        target.unlink(missing_ok=True)
         raise
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None

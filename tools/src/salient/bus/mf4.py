@@ -6,6 +6,7 @@ has only the frames that carry it.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import groupby
@@ -14,22 +15,27 @@ from typing import Any
 
 import can
 import numpy as np
+from cantools.database.can import Database
 
+from salient.bus.identity import Carrier, OtherDatabase, hash_of
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import UsageError
-from salient.machine.file import MachineError
 
 _DEFLATE = 1
 
 
 class Mf4Log:
-    """An MF4 file, written when it is closed; until then 16 bytes of memory for each frame.
+    """An MF4 file, written when it is closed; until then 16 bytes of memory for each frame. Its comment names the
+    machine.
+
+    write raises OtherDatabase, as Carrier does: with the first report of another machine than the one that is stated,
+    or of an unknown one, and then there is no file; or when the drive becomes another one, and the file ends there.
 
     Frames that the DBCs do not define are left out: other identifiers and lengths, remote, error and flexible data rate
     frames.
     """
 
-    def __init__(self, path: Path, machine: str | None, node: int) -> None:
+    def __init__(self, path: Path, machine: str | None, node: int, source: str) -> None:
         try:
             import asammdf
         except ImportError:
@@ -37,27 +43,45 @@ class Mf4Log:
         self._mdf: Any = asammdf.MDF(version="4.10")
         self._mdf.start_time = datetime.fromtimestamp(0, UTC)  # virtual time has no date
         self._signal = asammdf.Signal
-        try:
-            self._databases = (drive_database(machine, node), rig_database(node))
-        except MachineError as error:
-            raise UsageError(str(error)) from None
-        self._tables = tuple(SignalTable(database) for database in self._databases)
-        self._path = path
+        self._carrier, self._node = Carrier(source, machine, node), node
+        self._frames = tuple(SignalTable(database) for database in self._databases(None))
+        self._path, self._source = path, source
         path.open("wb").close()  # a path that cannot be written is reported before hours of recording
 
+    _refused = False
+
+    def _databases(self, machine: str | None) -> tuple[Database, Database]:
+        return drive_database(machine, self._node), rig_database(self._node)
+
     def write(self, time_ns: int, message: can.Message) -> None:
-        for table in self._tables:
+        try:
+            self._carrier.take(message)
+        except OtherDatabase:
+            if self._carrier.machine is None:
+                self._path.unlink(missing_ok=True)
+                self._refused = True
+            raise
+        for table in self._frames:
             table.add(time_ns, message)
 
     def close(self) -> None:
-        for name, comment, channels in self._groups():
+        if self._refused:
+            self._mdf.close()
+            return
+        machine = self._carrier.likely
+        if self._carrier.machine is None and len(self._frames[0]["DRIVE_STATUS.state"]):
+            print(f"salient: {self._source}: no DRIVE_IDENTITY: {self._path} has the signals of {machine}; "
+                  "--machine states another", file=sys.stderr)
+        self._mdf.header.comment = f"machine {machine}, DBC {hash_of(machine):08x}"
+        for name, comment, channels in self._groups(machine):
             self._mdf.append(channels, acq_name=name, comment=comment, common_timebase=True)
         self._mdf.save(self._path, overwrite=True, compression=_DEFLATE)
         self._mdf.close()
 
-    def _groups(self) -> Iterator[tuple[str, str, list[Any]]]:
+    def _groups(self, machine: str) -> Iterator[tuple[str, str, list[Any]]]:
         """Name, comment and channels of each group that has frames."""
-        for database, table in zip(self._databases, self._tables, strict=True):
+        for database, table in zip(self._databases(machine), self._frames, strict=True):
+            table.decode_with(database)
             for message in sorted(database.messages, key=lambda m: m.frame_id):
                 by_selector = sorted(message.signals, key=lambda signal: signal.multiplexer_ids or [])
                 for _, signals in groupby(by_selector, key=lambda signal: signal.multiplexer_ids):

@@ -12,12 +12,12 @@ import can
 from cantools.database.can import Database
 
 from salient.bus.clock import VirtualTimeReader, has_plain_data, nodes_of_drives, open_bus
+from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
 from salient.bus.interface import closed_in_order
 from salient.bus.log import open_log
 from salient.bus.selected_signals import SelectedSignals
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import UsageError
-from salient.machine.file import MachineError
 
 _COLUMNS = (
     ("state", "DRIVE_STATUS.state", "{:>10}"),
@@ -41,9 +41,9 @@ class _BusClosed(Exception):
     """The bus ended while this command was listening; the text is the reason of python-can."""
 
 
-def record(address: str, path: Path, duration_s: float | None, machine: str, node: int = 0) -> int:
+def record(address: str, path: Path, duration_s: float | None, machine: str | None, node: int = 0) -> int:
     """Writes every frame on a bus to a log file, on virtual time. machine, node: of the drive whose signals an MF4 file
-    has.
+    has, by default the machine that it reports.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
     every case. Returns the exit code: 1 when the bus closed early (see _report_closed) or an MF4 file has no frame of
@@ -54,12 +54,11 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path, machine, node)
+    log = open_log(path, machine, node, address)
     count, closed = 0, None
     nodes = _Nodes(address, node if path.suffix == ".mf4" else None)  # the other formats have the frames of all
     try:
-        for timed in _frames(address, duration_s, "recording", nodes.tell_absence):
-            nodes.add(*timed)
+        for timed in nodes.watch(_frames(address, duration_s, "recording", nodes.tell_absence)):
             log.write(*timed)
             count += 1
     except KeyboardInterrupt:
@@ -72,29 +71,32 @@ def record(address: str, path: Path, duration_s: float | None, machine: str, nod
     return _finish(address, duration_s, closed, nodes)
 
 
-def monitor(address: str, every_s: float, duration_s: float | None, machine: str,
+def monitor(address: str, every_s: float, duration_s: float | None, machine: str | None,
             signals: Sequence[str] | None = None, node: int = 0) -> int:
     """Prints the named signals, else the main ones of the drive of a machine and node number, every `every_s` of
     virtual time; ends as `record` does, with its exit code, which is 1 as well when no frame of the drive has come.
-    UsageError: no such machine, or no signal of a name."""
-    try:
-        database = drive_database(machine, node)
-    except MachineError as error:
-        raise UsageError(str(error)) from None
-    shown: _MainSignals | SelectedSignals = _MainSignals(database)
-    if signals:
-        width = shutil.get_terminal_size((_WIDTH, 1)).columns
-        shown = SelectedSignals((database, rig_database(node)), signals, width)
+    Without a machine it is that which the drive reports. UsageError: no such machine, or no signal of a name;
+    OtherDatabase: see Carrier."""
+    carrier = Carrier(address, machine, node)
+    shown = _shown(None, node, signals)  # for the names
     due_ns, closed = None, None
+    heard = True
     nodes = _Nodes(address, node)
+    frames = nodes.watch(_frames(address, duration_s, "monitoring", nodes.tell_absence))
     try:
-        for time_ns, message in _frames(address, duration_s, "monitoring", nodes.tell_absence):
-            nodes.add(time_ns, message)
+        for time_ns, message, begins in identified(frames, carrier):
+            if begins:
+                shown = _shown(carrier.likely, node, signals)
+                heard = carrier.machine is not None
             shown.add(time_ns, message)
             due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
             if time_ns < due_ns:
                 continue
             line = shown.line(time_ns)
+            if line and not heard and carrier.machine is None:
+                heard = True
+                print(f"salient: {address}: no DRIVE_IDENTITY within {IDENTITY_WAIT_NS / 1e9:g} s: the signals are "
+                      f"those of {carrier.likely}; --machine states another", file=sys.stderr, flush=True)
             if line:
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
@@ -102,6 +104,36 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
     except _BusClosed as end:
         closed = str(end)
     return _finish(address, duration_s, closed, nodes)
+
+
+def _shown(machine: str | None, node: int, signals: Sequence[str] | None) -> _MainSignals | SelectedSignals:
+    database = drive_database(machine, node)
+    if not signals:
+        return _MainSignals(database)
+    width = shutil.get_terminal_size((_WIDTH, 1)).columns
+    return SelectedSignals((database, rig_database(node)), signals, width)
+
+
+def identified(frames: Iterator[tuple[int, can.Message]], carrier: Carrier) -> Iterator[tuple[int, can.Message, bool]]:
+    """The frames, held back until the drive has reported its machine, or has not for IDENTITY_WAIT_NS; the first one
+    says so. OtherDatabase of the carrier."""
+    held: list[tuple[int, can.Message]] = []
+    knows = False
+    for time_ns, message in frames:
+        known = carrier.take(message)
+        if knows:
+            yield time_ns, message, False
+            continue
+        held.append((time_ns, message))
+        if known or time_ns - held[0][0] > IDENTITY_WAIT_NS:
+            knows = True
+            yield from _from_first(held)
+    if not knows:
+        yield from _from_first(held)
+
+
+def _from_first(held: list[tuple[int, can.Message]]) -> Iterator[tuple[int, can.Message, bool]]:
+    return ((time_ns, message, number == 0) for number, (time_ns, message) in enumerate(held))
 
 
 class _Nodes:
@@ -131,6 +163,12 @@ class _Nodes:
         self._from_ns = time_ns if self._from_ns is None else self._from_ns
         if time_ns - self._from_ns > _ABSENT_S * 1e9:
             self.tell_absence("; listening on")
+
+    def watch(self, frames: Iterator[tuple[int, can.Message]]) -> Iterator[tuple[int, can.Message]]:
+        """The frames, each of which is taken."""
+        for time_ns, message in frames:
+            self.add(time_ns, message)
+            yield time_ns, message
 
     def tell_absence(self, end: str = "; listening on") -> None:
         """One line, once, when the drive is absent."""

@@ -117,18 +117,25 @@ class SignalTable(Mapping[str, Signal]):
     """
 
     def __init__(self, database: Database, sender: str | None = None) -> None:
-        self._messages: dict[tuple[int, bool], Message] = {}
-        self._names: dict[str, tuple[tuple[int, bool], cantools.database.can.Signal]] = {}
+        self._sender = sender
         self._times: dict[tuple[int, bool], array[int]] = {}
         self._data: dict[tuple[int, bool], bytearray] = {}
         self._length: dict[tuple[int, bool], int] = {}
+        self.decode_with(database)
+        for key, message in self._messages.items():
+            self._times[key], self._data[key] = array("q"), bytearray()
+            self._length[key] = message.length
+
+    def decode_with(self, database: Database) -> None:
+        """Decodes by another database from here on, what there is already as well: that of another machine, which has
+        the same messages with other factors."""
+        self._messages: dict[tuple[int, bool], Message] = {}
+        self._names: dict[str, tuple[tuple[int, bool], cantools.database.can.Signal]] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
-            if sender is not None and sender not in message.senders:
+            if self._sender is not None and self._sender not in message.senders:
                 continue
             key = (message.frame_id, message.is_extended_frame)
             self._messages[key] = message
-            self._times[key], self._data[key] = array("q"), bytearray()
-            self._length[key] = message.length
             for signal in message.signals:
                 self._names.setdefault(signal.name, (key, signal))
                 self._names[f"{message.name}.{signal.name}"] = (key, signal)

@@ -2,7 +2,8 @@
 image, a drive of one machine is compiled with the sources.
 
 They are made once and never changed: their name is a hash of what they are made of. Any number of processes may make
-and use them at the same time. The folder may be removed while no drive is started.
+and use them at the same time. The folder may be removed while no drive is started. With an image the machine file is
+kept, under the hash of the drive's DBC, which a drive sends: its frames can be decoded when the file has been changed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 from salient.config import DEFAULTS, BenchConfig
 from salient.errors import UsageError, close_names
 from salient.machine.path import MachineError, machine_path, stated_conditions
-from salient.paths import BUILD, DRIVE_DBC, IS_WHEEL, PARAMETERS, PYTHON_PACKAGES
+from salient.paths import BUILD, DRIVE_DBC, EXAMPLE_MACHINES, IS_WHEEL, MACHINES, PARAMETERS, PYTHON_PACKAGES
 
 FOLDER = BUILD / "machines"
 IMAGE_SUFFIX = ".machine"
@@ -52,7 +53,33 @@ def made_once(path: Path, make: Callable[[Path], Mapping[str, bytes]], suffixes:
 def _image(path: Path) -> Mapping[str, bytes]:
     from salient.machine.image import image_of  # NumPy and pydantic: half of the time of a start
 
-    return {IMAGE_SUFFIX: image_of(path)}
+    return {**_copy(path), IMAGE_SUFFIX: image_of(path)}
+
+
+def _copy(path: Path) -> Mapping[str, bytes]:
+    """A machine file of the user and its map, in a folder of their own whose name has the hash of the drive's DBC; none
+    of a file with a map elsewhere, which it would not find from there."""
+    from salient.dbc import database_hash
+    from salient.machine.file import load_machine
+    from salient.machine.scaling import database_of, scaling_of
+
+    content = _content(path)
+    maps = map_of(path, content)
+    if path.parent in (MACHINES, EXAMPLE_MACHINES) or any(file.parent != path.parent for file in maps):
+        return {}
+    machine = load_machine(path)
+    folder = _copy_folder(database_hash(database_of(scaling_of(path, machine).dbc())))
+    return {**{f"{folder}/{file.name}": _content(file) for file in maps}, f"{folder}/{machine.name}.toml": content}
+
+
+def _copy_folder(dbc_hash: int) -> str:
+    return f".{dbc_hash:08x}"
+
+
+def kept_machines(dbc_hash: int) -> list[Path]:
+    """The machine files of the user with which drives of this DBC have been started, the newest first."""
+    found = [(file.stat().st_mtime_ns, file) for file in FOLDER.glob(f"*{_copy_folder(dbc_hash)}/*.toml")]
+    return [file for _, file in sorted(found, reverse=True)]
 
 
 def check_options(given: Iterable[str]) -> None:

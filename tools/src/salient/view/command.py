@@ -12,8 +12,9 @@ from typing import Any
 import can
 
 from salient.bench.stimulus import STIMULI, Stimulus, act_frames, stimuli
+from salient.bus.clock import VirtualTimeReader, open_bus
+from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
 from salient.bus.log_reader import read_log
-from salient.config import DEFAULTS
 from salient.errors import UsageError
 from salient.version import VERSION
 from salient.view.commands import COMMANDS
@@ -24,6 +25,8 @@ from salient.view.server import Feed, Server
 
 _CHUNK_FRAMES = 100_000
 _FAILURE_NOTES = "bench.json"
+_SILENCE_S = 1.0
+"""Wall time without a frame after which a page begins before the drive has said which machine it carries."""
 
 
 class BusFeed:
@@ -49,14 +52,15 @@ class LogFeed:
 
     link = None
 
-    def __init__(self, path: Path, machine: str, node: int, acts: list[Stimulus] | None = None) -> None:
-        """acts: what was done; without it what the log has of that."""
+    def __init__(self, path: Path, carrier: Carrier, node: int, acts: list[Stimulus] | None = None) -> None:
+        """acts: what was done; without it what the log has of that. OtherDatabase: see Carrier."""
         self.store = FrameStore(kept=1 << 62)
         chunk = Chunk()
         first_ns, last_ns = None, 0
         of_hosts: list[tuple[int, can.Message]] = []
-        relevant = act_frames(machine, (node,)) if acts is None else {}
+        relevant = act_frames(None, (node,)) if acts is None else {}
         for time_ns, message in read_log(path, "--replay"):
+            carrier.take(message)
             if (message.arbitration_id, message.is_extended_id) in relevant:
                 of_hosts.append((time_ns, message))
             if chunk.add(time_ns, message):
@@ -68,6 +72,7 @@ class LogFeed:
             self.store.put(chunk)
         if first_ns is None:
             raise UsageError(f"--replay {path}: the log has no data frame")
+        machine = carrier.likely
         if acts is None:
             acts = stimuli(of_hosts, last_ns, machine, (node,))
         self.ended = f"{path.name}: {self.store.next_number} frames"
@@ -83,11 +88,14 @@ def run(options: argparse.Namespace) -> int:
     """Serves the page until an interrupt; prints its link."""
     feed: Feed
     if options.replay is None:
-        feed = BusFeed(options.can, options.machine or DEFAULTS["machine"], options.node or 0)
+        carrier = Carrier(options.can, options.machine, options.node or 0)
+        _listen(options.can, carrier)
+        feed = BusFeed(options.can, carrier.likely, options.node or 0)
     else:
         path, notes = _log_of(options.replay)
-        feed = LogFeed(path, options.machine or notes.get("machine", DEFAULTS["machine"]),
-                       notes.get("node", 0) if options.node is None else options.node, _acts_of(notes))
+        node = notes.get("node", 0) if options.node is None else options.node
+        carrier = Carrier(str(path), options.machine, node, noted=notes.get("machine"))
+        feed = LogFeed(path, carrier, node, _acts_of(notes))
     server = Server(feed)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     print(f"live page: {server.link}", flush=True)
@@ -97,6 +105,18 @@ def run(options: argparse.Namespace) -> int:
         if feed.link is not None:
             feed.link.close()
     return 0
+
+
+def _listen(address: str, carrier: Carrier) -> None:
+    """Listens until the drive has said which machine it carries, or does not for IDENTITY_WAIT_NS, or is silent."""
+    with open_bus(address) as bus:
+        reader = VirtualTimeReader(bus)
+        begin_ns = None
+        while (timed := reader.receive(_SILENCE_S)) is not None:
+            time_ns, message = timed
+            begin_ns = time_ns if begin_ns is None else begin_ns
+            if carrier.take(message) or time_ns - begin_ns > IDENTITY_WAIT_NS:
+                return
 
 
 def _acts_of(notes: dict[str, Any]) -> list[Stimulus] | None:

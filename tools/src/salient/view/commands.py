@@ -12,6 +12,7 @@ import numpy as np
 from salient.bench.drive import DriveError
 from salient.bench.faults import FaultError, fault_kind
 from salient.bench.rig import Fault, RigError
+from salient.bus.identity import OtherDatabase
 from salient.view.link import Link
 
 COMMANDS: dict[str, dict[str, type]] = {
@@ -70,7 +71,7 @@ class Commander:
         action: Callable[..., Any] = getattr(self, f"_{name}")
         try:
             value = action(**arguments)
-        except (DriveError, RigError, FaultError) as error:
+        except (DriveError, OtherDatabase, RigError, FaultError) as error:
             return {"ok": False, "message": str(error)}
         except KeyError as error:
             return {"ok": False, "message": str(error.args[0])}

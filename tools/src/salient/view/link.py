@@ -12,11 +12,11 @@ from typing import Any
 import can
 from cantools.database.can import Database
 
-from salient.bench.drive import Drive, DriveError, OtherDatabase
+from salient.bench.drive import Drive, DriveError
 from salient.bench.rig import Rig, RigError
 from salient.bus.clock import VirtualTimeReader, open_bus
+from salient.bus.identity import OtherDatabase, hash_of, machines_of
 from salient.bus.signals import LatestSignals, SignalTable, drive_database, rig_database
-from salient.dbc import database_hash
 from salient.view.frames import Chunk, FrameStore
 
 _TICK_S = 0.004
@@ -65,7 +65,7 @@ class Link:
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
         self.telemetry: SignalTable = LatestSignals(self.drive_database, "DRIVE")
         self.truth: SignalTable = LatestSignals(self.rig_database, "RIG")
-        self._database_hash = database_hash(drive_database(machine))
+        self._machine = machine
         self._store, self._chunk = store, Chunk()
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
         self._wake = threading.Event()
@@ -99,10 +99,11 @@ class Link:
     def require_drive_database(self) -> None:
         """OtherDatabase when the drive has reported another DBC than the one of the page."""
         reported = self.telemetry["DRIVE_IDENTITY.dbc_hash"]
-        if len(reported) and int(reported.last) != self._database_hash:
-            raise OtherDatabase(f"the drive was built from another drive.dbc (hash {int(reported.last):08x}, here "
-                                f"{self._database_hash:08x}): a reference would be another one; give its machine by "
-                                "--machine")
+        if len(reported) and int(reported.last) != hash_of(self._machine):
+            carried = next(machines_of(int(reported.last)), "another machine")
+            raise OtherDatabase(f"the drive carries {carried}, of database {int(reported.last):08x}, the page shows "
+                                f"{self._machine}, of {hash_of(self._machine):08x}: a reference would be another one; "
+                                "start the page again")
 
     def send(self, message: can.Message) -> None:
         """Sends a frame."""

@@ -369,8 +369,8 @@ class Page {
         if (Number.isFinite(reported) && reported !== this.info.database_hash && !this.toldHash) {
             this.toldHash = true;
             const hex = (hash) => hash.toString(16).padStart(8, "0");
-            this.tell(`The drive was built from another drive.dbc (hash ${hex(reported)}, here `
-                + `${hex(this.info.database_hash)}): signals may be decoded wrongly. Give its machine by --machine.`, true);
+            this.tell(`The drive carries another machine than ${this.info.machine.name} (database ${hex(reported)}, here `
+                + `${hex(this.info.database_hash)}): signals may be decoded wrongly. Start the page again.`, true);
         }
     }
 }
