@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -16,6 +17,7 @@ from salient.bench import parameter_file
 from salient.bench.emulator import EmulatorProcess
 from salient.bench.session import Session
 from salient.config import BenchConfig
+from salient.machine.parameter_table import CHOICES, read_table
 
 
 @pytest.fixture
@@ -41,6 +43,36 @@ def test_saved_file_has_every_parameter_with_its_unit_and_is_equal_to_the_drive(
     assert "current_trip_A = 75.0  # A, 1.0 to 79.0\n" in file.read_text()
     compared = parameters("compare", file, "--can", can)
     assert (compared.returncode, compared.stdout) == (0, f"0 of {len(rows)} parameters differ\n")
+
+
+def test_values_that_select_something_have_names(can, tmp_path: Path):
+    file = tmp_path / "drive.toml"
+    assert parameters("save", file, "--can", can).returncode == 0
+    text = file.read_text()
+    assert 'controller = "salient"  # traditional, paper or salient\n' in text
+    assert 'bp_mode = "network_with_learning"  # off, fixed_gains, ' in text
+    file.write_text('bp_mode = "fixed_gains"\nload_source = 0\n')
+    compared = parameters("compare", file, "--can", can)
+    assert compared.stdout.splitlines() == [f"bp_mode: network_with_learning in the drive, fixed_gains in {file}",
+                                            "1 of 2 parameters differ"]
+    assert parameters("load", file, "--can", can).stdout == "bp_mode = fixed_gains\nload_source = observer\n"
+    with Session(can, lockstep=False) as session:
+        assert session.drive.parameters["bp_mode"] == 1
+    file.write_text('bp_mode = "fixed"\ncontroller = 3\ncurrent_trip_A = "salient"\n')
+    assert parameters("load", file, "--can", can).stderr.splitlines() == [
+        f"salient: {file}: bp_mode: 'fixed': must be off, fixed_gains, network_without_learning or "
+        "network_with_learning",
+        f"salient: {file}: controller: 3: must be traditional, paper or salient",
+        f"salient: {file}: current_trip_A: 'salient': must be a number from 1.0 to 79.0 A"]
+
+
+def test_names_of_values_are_those_of_the_table():
+    rows = {row.name: row for row in read_table()}
+    for name, values in CHOICES.items():
+        row = rows[name]
+        assert (row.minimum, row.maximum, row.fraction_bits, row.unit) == (0, len(values) - 1, 0, "")
+        for number, value in enumerate(values):
+            assert re.search(rf"\b{number} (of (the|a) )?{value.replace('_', ' ')}\b", row.text), (name, value)
 
 
 def test_loaded_file_is_in_the_drive_and_differences_are_listed(can, tmp_path: Path):

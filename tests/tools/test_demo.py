@@ -185,9 +185,13 @@ def test_picture_of_the_readme_is_that_of_the_demo(demo_folder):
                                                     ("linear_trapezoid", (0.0673, 0.072)),
                                                     ("finite_element", (0.0132, 0.024))])
 def test_other_machines_are_within_the_same_bounds(machine, settles_s, tmp_path):
-    demo.run(options("--out", tmp_path, "--machine", machine), stream=io.StringIO())
+    stream = io.StringIO()
+    demo.run(options("--out", tmp_path, "--machine", machine), stream=stream)
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert results["conditions"]["machine"] == machine
+    point = results["conditions"]["operating_point"]
+    assert f" start to {point['start_rpm']:g} r/min, by paper\n" in stream.getvalue()
+    assert f"\n{point['step_rpm']:g} r/min, load step of {point['load_Nm']:g} N m at " in stream.getvalue()
     start, step = results["experiments"]["start_600"]["paper"], results["experiments"]["load_step_150"]
     assert settles_s[0] < start["settling_time_s"] <= settles_s[1]
     # The reaching law of the finite-element machine, steep for salient, is that of the paper's controller, too.

@@ -271,13 +271,20 @@ def test_page_and_plots_accept_any_controllers_in_any_order(runs, content, contr
 
 def test_summary_has_a_published_column_only_for_published_values(content):
     lines = demo.summary(content).splitlines()
-    assert [line.split() for line in lines if line.startswith("start_600")] == [
-        ["start_600", "traditional", "published", "paper", "published", "salient"]]
+    assert [lines[at + 1].split() for at, line in enumerate(lines) if line.endswith("(start_600)")] == [
+        ["traditional", "published", "paper", "published", "salient"]]
     (ripple,) = (line for line in lines if "K_t" in line)
     assert ripple.split()[3:] == [f"{content['experiments']['load_step_150'][controller]['torque_ripple']:.4f}" if ours
                                   else f"{content['paper']['load_step_150'][controller]['torque_ripple']:g}"
                                   for controller, ours in (("traditional", True), ("traditional", False),
                                                            ("paper", True), ("paper", False), ("salient", True))]
+
+
+def test_summary_states_the_speeds_and_the_load_that_were_used(content):
+    point = {**content["conditions"]["operating_point"], "start_rpm": 430.0, "step_rpm": 110.0, "load_Nm": 0.034}
+    summary = demo.summary({**content, "conditions": {**content["conditions"], "operating_point": point}})
+    assert "Start to 430 r/min, no load (start_600)\n" in summary
+    assert "\n110 r/min, load step of 0.034 N m at " in summary
 
 
 def test_page_shows_losses_and_iron_loss_only_where_estimated(content, plot_files, tmp_path):

@@ -18,7 +18,7 @@ from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
 from salient.bus.identity import OtherDatabase
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
-from salient.errors import RunFailed, UsageError, close_names
+from salient.errors import RunFailed, close_names
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")

@@ -2,22 +2,25 @@
 
     # parameters of a drive, in the units of the comments
     current_trip_A = 75.0  # A, 1 to 79
-    controller = 2  # 0 to 2
+    controller = "salient"  # traditional, paper or salient
 
 A value is the shortest decimal number that gives the drive's integer again, so that a file that was saved is loaded
-without a difference.
+without a difference. Of a parameter that selects something it is the name; its number is taken as well.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from pathlib import Path
 
 from salient.bench.drive import ParameterRow, raw_value
 from salient.bench.session import SILENCE_MAX_S, Session
+from salient.config import either
 from salient.errors import UsageError, close_names, shown
+from salient.machine.parameter_table import CHOICES, value_name
 from salient.toml_file import TextFileError, read_toml
 
 
@@ -41,8 +44,9 @@ def save(session: Session, path: Path) -> int:
     parameters = session.drive.parameters
     lines = ["# parameters of a drive"]
     for name, row in parameters.rows.items():
-        comment = f"{row.unit + ', ' if row.unit else ''}{_range(row)}"
-        lines.append(f"{name} = {decimal(row, parameters[name])}  # {comment}")
+        comment = f"{row.unit + ', ' if row.unit else ''}{_allowed(row)}"
+        value = named(row, parameters[name])
+        lines.append(f"{name} = {json.dumps(value) if name in CHOICES and not value.isdigit() else value}  # {comment}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -62,7 +66,7 @@ def compare(session: Session, path: Path) -> int:
         present = session.drive.parameters[name]
         if raw_value(row, value) != raw_value(row, present):
             differences += 1
-            print(f"{name}: {decimal(row, present)} in the drive, {decimal(row, value)} in {path} {row.unit}".rstrip())
+            print(f"{name}: {named(row, present)} in the drive, {named(row, value)} in {path} {row.unit}".rstrip())
     print(f"{differences} of {len(wanted)} parameters differ")
     return 1 if differences else 0
 
@@ -73,7 +77,7 @@ def load(session: Session, path: Path, store: bool) -> int:
     values = read(path, session.drive.parameters.rows)
     session.drive.parameters.update(values)
     for name, value in values.items():
-        print(f"{name} = {decimal(session.drive.parameters.row(name), value)}")
+        print(f"{name} = {named(session.drive.parameters.row(name), value)}")
     if store:
         session.drive.parameters.save()
         print("stored in the memory of the drive")
@@ -99,6 +103,7 @@ def read(path: Path, rows: dict[str, ParameterRow]) -> dict[str, float]:
         entries = read_toml(path)
     except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None
+    entries = {name: _number(name, value) for name, value in entries.items()}
     mistakes = [f"{path}: {text}" for name, value in entries.items() if (text := _mistake(name, value, rows))]
     for line in mistakes[:-1]:
         print(f"salient: {line}", file=sys.stderr)
@@ -111,11 +116,27 @@ def _mistake(name: str, value: object, rows: dict[str, ParameterRow]) -> str:
     if name not in rows:
         return f"{shown(name)}: unknown parameter; {close_names(name, rows)}"
     row = rows[name]
-    allowed = f"{name}: {shown(value)}: must be a number from {_range(row)} {row.unit}".rstrip()
+    kind = "" if name in CHOICES else "a number from "
+    allowed = f"{name}: {shown(value)}: must be {kind}{_allowed(row)} {row.unit}".rstrip()
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return allowed
     lsb = math.ldexp(1.0, -row.fraction_bits)
     return "" if row.minimum - lsb / 2 <= value <= row.maximum + lsb / 2 else allowed
+
+
+def _number(name: str, value: object) -> object:
+    """The number of a value that is given by its name, else what is given."""
+    names = CHOICES.get(name, ())
+    return names.index(value) if isinstance(value, str) and value in names else value
+
+
+def _allowed(row: ParameterRow) -> str:
+    return either(CHOICES[row.name]) if row.name in CHOICES else _range(row)
+
+
+def named(row: ParameterRow, value: float) -> str:
+    """A value by its name, or as `decimal`."""
+    return value_name(row.name, value) or decimal(row, value)
 
 
 def _range(row: ParameterRow) -> str:

@@ -20,7 +20,7 @@ from salient.bench.arming import response_to
 from salient.bus import e2e
 from salient.bus.signals import drive_database, rig_database
 from salient.machine.file import load_machine, machine_path
-from salient.machine.parameter_table import read_table
+from salient.machine.parameter_table import read_table, value_name
 from salient.machine.scaling import Exponents, scaling_of
 
 if TYPE_CHECKING:
@@ -241,6 +241,8 @@ class _Reader:
         if index >= len(self._rows):
             return f"parameter {index} = {raw}"
         row = self._rows[index]
+        if (name := value_name(row.name, raw)) is not None:
+            return f"{row.name} = {name}"
         return f"{row.name} = {_with_unit(math.ldexp(raw, -self._fraction_bits[index]), row.unit)}"
 
     def _write(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:

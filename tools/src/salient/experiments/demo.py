@@ -29,7 +29,9 @@ from salient.config import BenchConfig
 from salient.errors import cannot_write
 from salient.experiments import metrics, plots
 from salient.experiments.report import (
+    EXPERIMENT_TITLE,
     METRIC_ROWS,
+    SHORT_TITLE,
     captions,
     format_metric,
     format_published,
@@ -76,6 +78,8 @@ class DemoFailed(Exception):
 class _Run:
     """Result of a run, as its worker process returns it."""
 
+    name: str
+    """For a reader: speed, load and controller."""
     experiment: str
     scenario: Scenario
     window_s: tuple[float, float]
@@ -135,7 +139,8 @@ def summary(results: Mapping[str, Any]) -> str:
     for experiment, by_controller in results["experiments"].items():
         published = published_of(results, experiment)
         heads = (f"{controller:>16}" + f"{'published':>14}" * (controller in published) for controller in by_controller)
-        lines += ["", f"{experiment:<30}" + "".join(heads)]
+        title = EXPERIMENT_TITLE[experiment].format_map(results["conditions"]["operating_point"])
+        lines += ["", f"{title} ({experiment})", " " * 30 + "".join(heads)]
         for name in next(iter(by_controller.values())):
             cells = (f"{format_metric(name, of[name]):>16}"
                      + (f"{format_published(name, published[controller][name]):>14}" if controller in published else "")
@@ -164,19 +169,19 @@ def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     return scenarios
 
 
-def _run_all(workers: Executor, scenarios: Mapping[str, Iterable[Scenario]], out: Path, can: str,
+def _run_all(workers: Executor, scenarios: Mapping[str, Sequence[Scenario]], out: Path, can: str,
              build: str, progress: Progress) -> list[_Run]:
     futures = {}
+    point = _conditions(scenarios)["operating_point"]
     for experiment, of in scenarios.items():
         for scenario in of:
             folder = out / "runs" / f"{experiment}_{scenario.controller}"
-            futures[f"{experiment} by {scenario.controller}"] = workers.submit(_run_one, experiment, scenario, folder,
-                                                                               can, build)
+            name = f"{SHORT_TITLE[experiment].format_map(point)}, by {scenario.controller}"
+            futures[name] = workers.submit(_run_one, name, experiment, scenario, folder, can, build)
     return _gather(futures, progress)
 
 
-def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str, build: str) -> _Run:
-    name = f"{experiment} by {scenario.controller}"
+def _run_one(name: str, experiment: str, scenario: Scenario, folder: Path, can: str, build: str) -> _Run:
     try:
         result = run_scenario(scenario, folder, can, build)
     except (EmulatorError, SessionError, DriveError, CanError) as error:
@@ -191,7 +196,7 @@ def _run_one(experiment: str, scenario: Scenario, folder: Path, can: str, build:
         losses = metrics.losses(result.recording, machine, window_s)
     except metrics.MetricsError as error:
         raise DemoFailed(f"{name}: {error}; see {result.text_log_path}") from error
-    return _Run(experiment, scenario, window_s, values, losses,
+    return _Run(name, experiment, scenario, window_s, values, losses,
                 (result.log_path, result.text_log_path), result.recording_path)
 
 
@@ -292,7 +297,7 @@ def _files(runs: Iterable[_Run], recordings: Iterable[list[tuple[str, Path]]],
     """The files of each run, in the form of write_report. recordings: of each run, from _thin."""
     logs = ("CAN log (BLF)", "CAN log (candump text)")
     return [("The results of this page, for scripts", [("results.json", "results.json")])] + [
-        (f"{result.experiment} by {result.controller}, on virtual time",
+        (f"{result.name}, on virtual time",
          [(title, path.relative_to(out).as_posix())
           for title, path in (*zip(logs, result.log_paths, strict=True), *kept)])
         for result, kept in zip(runs, recordings, strict=True)]

@@ -21,6 +21,8 @@ EXPERIMENT_TITLE = {
     "load_step_150": "{step_rpm:g} r/min, load step of {load_Nm:g} N m at {step_at_s:g} s",
 }
 """Titles, with keys of conditions.operating_point, as below."""
+SHORT_TITLE = {"start_600": "start to {start_rpm:g} r/min",
+               "load_step_150": "{step_rpm:g} r/min, step of {load_Nm:g} N m"}
 STEADY_STATE_TITLE = {"start_600": "{start_rpm:g} r/min, no load",
                       "load_step_150": "{step_rpm:g} r/min, {load_Nm:g} N m"}
 """Operating points of the power balance, by experiment."""

@@ -8,10 +8,18 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 
+from salient.config import CONTROLLERS
 from salient.paths import PARAMETERS
 
 SAME_UNITS = ("", "1/s", "s", "ms", "deg", "rad/s", "C")
 """Units of the parameters whose range and resolution are the same for every machine."""
+
+CHOICES = {
+    "controller": CONTROLLERS,
+    "bp_mode": ("off", "fixed_gains", "network_without_learning", "network_with_learning"),
+    "load_source": ("observer", "torque_transducer"),
+}
+"""Names of the values of parameters that select something, from 0; their texts in the table have the same words."""
 
 _CONSTANTS = {"INT32_MAX": 2**31 - 1}
 
@@ -46,6 +54,12 @@ class ParameterDefinition:
             if abs(rounded - value) < lsb / 2:
                 return f"{float(rounded):.{digits}f}"
         raise ValueError(f"{self.name}: {raw} has no decimal number of 11 digits")
+
+
+def value_name(name: str, value: float) -> str | None:
+    """Name of a value of a parameter; None where it has none."""
+    names = CHOICES.get(name, ())
+    return names[int(value)] if value in range(len(names)) else None
 
 
 @lru_cache
