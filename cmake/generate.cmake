@@ -76,8 +76,7 @@ function(salient_add_machines)
         add_custom_command(
             OUTPUT ${out}/machine_tables.c ${out}/machine_plant.c ${out}/machine.image
             COMMAND ${SALIENT_GENERATOR} salient.generate.machine ${file} ${out}
-            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py
-                    ${SALIENT_GENERATOR_SOURCES}/generate/machine_sources.py ${SALIENT_CODEC_GENERATOR}
+            DEPENDS ${file} ${SALIENT_GENERATOR_SOURCES}/generate/machine.py ${SALIENT_CODEC_GENERATOR}
                     ${generator_sources}
             DEPFILE ${out}/machine.d # parameters, DBC, of a map: its CSV file
             COMMENT "machine ${name}"

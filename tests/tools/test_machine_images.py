@@ -18,8 +18,7 @@ from flux_map_files import csv_text, formula, rows, write_machine
 from salient.bench.programs import executable
 from salient.errors import UsageError
 from salient.generate import machine as generate_machine
-from salient.generate import machine_sources
-from salient.machine import cache, image
+from salient.machine import cache, image, sources
 from salient.machine.cache import machine_image
 from salient.paths import MACHINES, ROOT
 
@@ -100,13 +99,14 @@ def test_image_is_made_once_and_again_when_file_or_map_change(empty_cache: Path,
     third = machine_image(str(path))
     contents = {made.read_bytes() for made in (first, second, third)}
     assert len(contents) == 3
-    assert {entry.name for entry in empty_cache.iterdir()} == {made.name for made in (first, second, third)}
+    assert {entry.name for entry in empty_cache.glob(f"*{cache.IMAGE_SUFFIX}")} == {
+        made.name for made in (first, second, third)}
     path.write_text(text, encoding="utf-8")
     flux_map.write_bytes((copied / flux_map.name).read_bytes())
     assert machine_image(str(path)) == first
 
 
-def test_c_sources_are_made_once_for_all_builds_and_again_when_the_file_changes(empty_cache, tmp_path, monkeypatch):
+def test_c_sources_and_image_are_made_once_for_all_and_again_when_the_file_changes(empty_cache, tmp_path, monkeypatch):
     path = variation(tmp_path, "compiled")
     runs = []
 
@@ -114,13 +114,14 @@ def test_c_sources_are_made_once_for_all_builds_and_again_when_the_file_changes(
         runs.append(file)
         return original(file)
 
-    original = machine_sources.files_of
-    monkeypatch.setattr(machine_sources, "files_of", files_of)
+    original = sources.files_of
+    monkeypatch.setattr(sources, "files_of", files_of)
     names = ("machine_tables.c", "machine_plant.c", "machine.image", "machine.d")
+    of_the_drive = machine_image(str(path)).read_bytes()
     for build in ("host", "cortex-m4"):
         assert generate_machine.main([str(path), str(tmp_path / build)]) == 0
     host, target = ([(tmp_path / build / name).read_bytes() for name in names] for build in ("host", "cortex-m4"))
-    assert host[:3] == target[:3] and machine_image(str(path)).read_bytes() == host[2]
+    assert host[:3] == target[:3] and of_the_drive == host[2]
     assert host[3].startswith(str(tmp_path / "host").encode())
     assert target[3].startswith(str(tmp_path / "cortex-m4").encode())
     assert len(runs) == 1
@@ -135,17 +136,17 @@ def test_image_of_a_file_that_changes_meanwhile_is_that_of_its_content(empty_cac
     before = path.read_text(encoding="utf-8")
     made = []
 
-    def image_of(file: Path) -> bytes:
+    def files_of(file: Path) -> tuple[str, str, bytes]:
         result = original(file)
         if not made:  # an editor writes the file between reading and naming
             path.write_text(before.replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.04"), encoding="utf-8")
-        made.append(result)
+        made.append(result[2])
         return result
 
-    original = image.image_of
-    monkeypatch.setattr(image, "image_of", image_of)
+    original = sources.files_of
+    monkeypatch.setattr(sources, "files_of", files_of)
     assert machine_image(str(path)).read_bytes() == made[1] != made[0]
-    assert len(list(empty_cache.iterdir())) == 1
+    assert len(list(empty_cache.glob(f"*{cache.IMAGE_SUFFIX}"))) == 1
 
 
 def test_rejected_file_leaves_no_image(empty_cache: Path, tmp_path: Path):

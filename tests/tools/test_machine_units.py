@@ -13,12 +13,12 @@ import pytest
 from salient.bus.signals import drive_database
 from salient.dbc import database_hash
 from salient.generate import resolution
-from salient.generate.machine_sources import tables_source
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.image import firmware_tables
 from salient.machine.magnetics import Formula
 from salient.machine.parameter_table import read_table
 from salient.machine.scaling import Exponents, Scaling, database_of, drive_dbc, scaling_of
+from salient.machine.sources import tables_source
 from salient.paths import DRIVE_DBC, MACHINES, ROOT
 
 OTHERS = ROOT / "tests" / "machines"

@@ -10,11 +10,12 @@ import fcntl
 import hashlib
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
-from salient.builder import run_commands
+from salient.builder import build_preset, run_commands
 from salient.config import TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
 from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
@@ -25,6 +26,8 @@ from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, program
 _BUILDERS = {"host": "any tools/salient command",
              "debug": "cmake --preset debug && cmake --build --preset debug",
              **{build: f"any tools/salient command with --target {build}" for build in TARGETS[1:]}}
+_IMAGE_PARTS = ("drive_codec", "salient_firmware", "salient_port", "salient_main")
+"""Targets of CMake that images of every machine have in common."""
 
 
 class EmulatorError(RunFailed):
@@ -102,7 +105,8 @@ def _built(build: str, name: str, builder: str) -> Path:
 
 @lru_cache
 def _build_custom(path: Path, key: str, build: str) -> Path:
-    """Builds the image for a user's machine file in a folder for its path and content, one process at a time."""
+    """Builds the image for a user's machine file in a folder for its path and content, one process at a time. Of the
+    sources only its tables are compiled: it links the firmware of the target build."""
     if shutil.which("cmake") is None:
         raise UsageError("cmake is missing; a machine file of your own on a target requires a build")
     _remove_orphans()
@@ -113,16 +117,25 @@ def _build_custom(path: Path, key: str, build: str) -> Path:
         (folder / "machine_file").write_text(str(path), encoding="utf-8")
         commands = []
         if not (folder / build / "build.ninja").exists():
-            commands.append(["cmake", "--preset", build, "-B", str(folder / build), f"-DSALIENT_MACHINE_FILE={path}"])
+            commands.append(["cmake", "--preset", build, "-B", str(folder / build), f"-DSALIENT_MACHINE_FILE={path}",
+                             f"-DSALIENT_BUILT={BUILD / build}", f"-DSALIENT_PYTHON={sys.executable}"])
         commands.append(["cmake", "--build", str(folder / build), "--target", "custom_image"])
         log = folder / "build.log"
 
+        @cache
         def notice() -> None:
             print(f"salient: building the firmware for {path}", file=sys.stderr, flush=True)
 
-        if not run_commands(commands, ROOT, log, notice):
+        if not (_build_parts(build, log, notice) and run_commands(commands, ROOT, log, notice)):
             raise EmulatorError(f"building the firmware for {path} failed: see {log.relative_to(ROOT)}")
     return folder / build / "bin" / "salient_custom.elf"
+
+
+def _build_parts(build: str, log: Path, notice: Callable[[], None]) -> bool:
+    """Brings what the images of a target build link up to date; no two commands build at once."""
+    with (BUILD / "launcher.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return build_preset(ROOT, build, _IMAGE_PARTS, log, notice)
 
 
 def _remove_orphans() -> None:

@@ -19,9 +19,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from salient.generate.files import write_files
-from salient.generate.machine_sources import plant_source
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.scaling import scaling_of
+from salient.machine.sources import plant_source
 
 # Base units and display units (name, factor: display value = factor * value) of each unit.
 UNITS: dict[str, tuple[dict[str, int], dict[str, float]]] = {

@@ -8,30 +8,21 @@ all builds (salient.machine.cache).
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 from salient.errors import UsageError
 from salient.generate.files import write_files
-from salient.machine.cache import IMAGE_SUFFIX, made_once, map_of
+from salient.machine.cache import IMAGE_SUFFIX, PLANT_SUFFIX, TABLES_SUFFIX, files_by_content, map_of
 from salient.machine.path import MachineError
 from salient.paths import DRIVE_DBC, PARAMETERS
 
-_NAMES = {".tables.c": "machine_tables.c", ".plant.c": "machine_plant.c", IMAGE_SUFFIX: "machine.image"}
-
-
-def _make(path: Path) -> Mapping[str, bytes]:
-    # NumPy and pydantic would take most of the time where the files exist.
-    from salient.generate.machine_sources import files_of
-
-    tables, plant, image = files_of(path)
-    return {".tables.c": tables.encode(), ".plant.c": plant.encode(), IMAGE_SUFFIX: image}
+_NAMES = {TABLES_SUFFIX: "machine_tables.c", PLANT_SUFFIX: "machine_plant.c", IMAGE_SUFFIX: "machine.image"}
 
 
 def machine_files(file: Path, folder: Path) -> dict[str, str | bytes]:
     """Contents of machine_tables.c, machine_plant.c, machine.image and their dependency file machine.d, to be written
     to `folder`; MachineError, UsageError."""
-    kept = made_once(file, _make, tuple(_NAMES))
+    kept = files_by_content(file, tuple(_NAMES))
     made: dict[str, str | bytes] = {name: path.read_bytes() for name, path in zip(_NAMES.values(), kept, strict=True)}
     outputs = " ".join(_escaped(folder / name) for name in made)
     # Never empty: CMake drops a dependency file without inputs, and Ninja would regenerate on every build.

@@ -23,6 +23,7 @@ from salient.paths import BUILD, DRIVE_DBC, EXAMPLE_MACHINES, IS_WHEEL, MACHINES
 
 FOLDER = BUILD / "machines"
 IMAGE_SUFFIX = ".machine"
+TABLES_SUFFIX, PLANT_SUFFIX = ".tables.c", ".plant.c"
 _BYTES_MAX = 30_000_000
 """More than machine files and maps may have."""
 
@@ -30,30 +31,30 @@ _BYTES_MAX = 30_000_000
 def machine_image(name_or_path: str) -> Path:
     """The image of a bundled machine or a machine file. UsageError: a mistake in the file, one line that names it."""
     try:
-        return made_once(machine_path(name_or_path), _image)[0]
+        return files_by_content(machine_path(name_or_path))[0]
     except MachineError as error:
         raise UsageError(str(error)) from None
 
 
-def made_once(path: Path, make: Callable[[Path], Mapping[str, bytes]], suffixes: Sequence[str] = (IMAGE_SUFFIX,)
-              ) -> list[Path]:
-    """Files of these suffixes, which `make` makes of a machine file: suffix -> content, and all that it makes is kept.
-    MachineError of `make`; UsageError: they cannot be kept."""
+def files_by_content(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> list[Path]:
+    """Files of these suffixes of a machine file; all are made at once (files_of of salient.machine.sources).
+    MachineError: a mistake in the file; UsageError: they cannot be kept."""
     while True:
         key = content_key(path)
         kept = [FOLDER / f"{key}{suffix}" for suffix in suffixes]
         if all(file.exists() for file in kept):
             return kept
-        made = make(path)
+        made = _make(path)
         if content_key(path) == key:  # else the file was changed meanwhile
             for suffix, content in made.items():
                 _write(FOLDER / f"{key}{suffix}", content)
 
 
-def _image(path: Path) -> Mapping[str, bytes]:
-    from salient.machine.image import image_of  # NumPy and pydantic: half of the time of a start
+def _make(path: Path) -> Mapping[str, bytes]:
+    from salient.machine.sources import files_of  # NumPy and pydantic: half of the time of a start
 
-    return {**_copy(path), IMAGE_SUFFIX: image_of(path)}
+    tables, plant, image = files_of(path)
+    return {**_copy(path), TABLES_SUFFIX: tables.encode(), PLANT_SUFFIX: plant.encode(), IMAGE_SUFFIX: image}
 
 
 def _copy(path: Path) -> Mapping[str, bytes]:
@@ -130,8 +131,7 @@ def _generator() -> bytes:
     """Hash of everything that the image and the C sources of a given file depend on."""
     folder = Path(__file__).parent
     digest = hashlib.sha256()
-    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")),
-              folder.with_name("generate") / "machine_sources.py", DRIVE_DBC, PARAMETERS]
+    others = [*map(folder.with_name, ("toml_file.py", "config.py", "dbc.py")), DRIVE_DBC, PARAMETERS]
     if IS_WHEEL:
         from importlib.metadata import version  # takes as long as the rest of a start
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from salient.dbc import database_hash
-from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal, load_machine
+from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
     CURRENT_A,
@@ -35,7 +35,7 @@ from salient.machine.heat import thermal_constants
 from salient.machine.magnetics import FORMULA_KEYS
 from salient.machine.partial_pulse import PARTS
 from salient.machine.pulse_tables import PulseTables, pulse_tables
-from salient.machine.scaling import Scaling, database_of, scaling_of
+from salient.machine.scaling import Scaling, database_of
 from salient.machine.sharing_tables import SharingTables, sharing_tables
 from salient.machine.sharing_window import PARTS as SHARING_PARTS
 from salient.machine.sharing_window import SPEEDS, sharing_window
@@ -281,10 +281,3 @@ def image(machine: Machine, scaling: Scaling, tables: FirmwareTables) -> bytes:
     ]
     checked = HEADER.pack(b"", 0, 0, *map(len, parts))[_CHECKED_FROM:] + b"".join(parts)
     return MAGIC + struct.pack("<II", LAYOUT, zlib.crc32(checked)) + checked
-
-
-def image_of(path: Path) -> bytes:
-    """The machine image of a machine file; MachineError."""
-    machine = load_machine(path)
-    scaling = scaling_of(path, machine)
-    return image(machine, scaling, firmware_tables(path, machine, scaling))
