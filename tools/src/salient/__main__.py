@@ -10,11 +10,13 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import RunFailed, UsageError, exit_code
+from salient.light_can import without_mf4
 from salient.paths import BUILD, make_folder, scenario_path
 
 
 def main() -> int:
     """Runs a command; returns the exit code: 0 done, 1 the thing tested failed, 2 a mistake of the caller."""
+    without_mf4()
     options = argparse.Namespace()
     return exit_code(lambda: _run_command(options), lambda: _place(options))
 
