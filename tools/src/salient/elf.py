@@ -7,7 +7,7 @@ import re
 import struct
 import subprocess
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 from salient.errors import UsageError
@@ -47,7 +47,8 @@ class Instruction:
 
 
 class ElfImage:
-    """path: an ELF file. UsageError when its processor is unknown."""
+    """path: an ELF file, of which symbols, instructions and locations are read once. UsageError when its processor is
+    unknown."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -57,6 +58,7 @@ class ElfImage:
             raise UsageError(f"{path}: ELF machine {machine}: must be one of {', '.join(map(str, _PROCESSORS))}")
         self._prefix, self._package, self.exception_frame_bytes = _PROCESSORS[machine]
         self.is_riscv = machine == _RISCV
+        self._locations: dict[int, list[SourceLocation]] = {}
 
     def run(self, tool: str, *arguments: str, given: str | None = None) -> str:
         """Output of one of the binutils, called with the arguments followed by the image."""
@@ -68,6 +70,10 @@ class ElfImage:
 
     def symbols(self) -> dict[str, int]:
         """Addresses of the symbols by name."""
+        return self._symbols
+
+    @cached_property
+    def _symbols(self) -> dict[str, int]:
         rows = (line.split() for line in self.run("nm").splitlines())
         return {row[2]: int(row[0], 16) for row in rows if len(row) == 3}
 
@@ -113,6 +119,10 @@ class ElfImage:
 
     def instructions(self) -> list[Instruction]:
         """Instructions of all functions, by address."""
+        return self._instructions
+
+    @cached_property
+    def _instructions(self) -> list[Instruction]:
         rows = (line.split() for line in self.run("readelf", "-sW").splitlines())
         functions = {row[7] for row in rows if len(row) == 8 and row[3] == "FUNC"}
         found, function = [], ""
@@ -128,6 +138,11 @@ class ElfImage:
 
     def locations(self, addresses: list[int]) -> dict[int, list[SourceLocation]]:
         """By address: the location in which the instruction is written, then those into which it is inlined."""
+        unknown = [address for address in addresses if address not in self._locations]
+        self._locations |= self._read_locations(unknown) if unknown else {}
+        return {address: self._locations[address] for address in addresses if address in self._locations}
+
+    def _read_locations(self, addresses: list[int]) -> dict[int, list[SourceLocation]]:
         given = "".join(f"{address:#x}\n" for address in addresses)
         lines = self.run("addr2line", "-a", "-f", "-i", "-e", given=given).splitlines()
         locations: dict[int, list[SourceLocation]] = {}

@@ -201,6 +201,16 @@ class Model:
         addresses = {one.address for node in self._nodes() for one in self._block(node).instructions}
         return self.image.locations(sorted(addresses))
 
+    @cached_property
+    def _nodes_by_function(self) -> defaultdict[str, list[_Node]]:
+        """Blocks with an instruction of a function or of what is inlined into it, by the function's name."""
+        found: defaultdict[str, list[_Node]] = defaultdict(list)
+        for node in self._nodes():
+            functions = {here.function for one in self._block(node).instructions for here in self.chain(one.address)}
+            for function in functions:
+                found[function].append(node)
+        return found
+
     def chain(self, address: int) -> list[SourceLocation]:
         """The location in which an instruction is written, then those into which it is inlined; the function of the
         linker's symbol where the image has no locations."""
@@ -373,7 +383,7 @@ class Model:
         """
         found: defaultdict[tuple[int, _Call], list[_Node]] = defaultdict(list)
         mixed: defaultdict[tuple[int, _Call], set[int]] = defaultdict(set)
-        for node in self._nodes():
+        for node in self._nodes_by_function[function]:
             calls = {_call_of(function, self.chain(one.address)) for one in self._block(node).instructions}
             for call in calls - {None}:
                 assert call is not None

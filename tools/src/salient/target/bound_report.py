@@ -27,11 +27,15 @@ _FUNCTIONS_SHOWN = 30
 def bound(variant: str, build: str, section: str = "interrupt") -> Bound | None:
     """Bound of an interrupt in the present build; None when the image does not have the interrupt."""
     of = VARIANTS[variant]
-    elf = ElfImage(image(of.machine, build))
+    elf = _image_of(image(of.machine, build))
     handler = HANDLERS[section]
     if handler not in elf.symbols() and handler != CONTROL:
         return None
-    return Model(elf, read_facts(), of.controller, handler).solve()
+    return Model(elf, _facts(), of.controller, handler).solve()
+
+
+_image_of = lru_cache(ElfImage)
+_facts = lru_cache(read_facts)
 
 
 def bounds(build: str) -> dict[str, dict[str, int]]:
