@@ -46,7 +46,7 @@ class _Shell(Session):
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__(options.can, lockstep=False, machine=options.machine, node=options.node,
-                         silence_max_s=SILENCE_MAX_S, signals=LatestSignals)
+                         silence_max_s=SILENCE_MAX_S, signals=LatestSignals, machine_option="--machine")
         self.foreign = []
         self._own: deque[tuple[int, bytes]] = deque(maxlen=_OWN_FRAMES)  # the bus returns them
         self._commands = {self.drive_database.get_message_by_name(name).frame_id for name, _ in _REFERENCES.values()}
