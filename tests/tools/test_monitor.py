@@ -134,18 +134,18 @@ def test_node_without_a_drive_is_told_once_with_the_nodes_that_are_heard(listen)
 
 @pytest.mark.parametrize("end", ["duration", "interrupt", "bus"])
 def test_node_that_was_never_heard_is_exit_code_1(listen, end):
-    process = listen("monitor", "--node", "2", "--signals", "DRIVE_STATUS.state", "--duration-s", "0.2",
+    process = listen("monitor", "--node", "2", "--signals", "DRIVE_STATUS.state", "--duration-s", "0.5",
                      activity="monitoring")
-    listen.bench.run_for(0.15)
+    listen.bench.run_for(0.4)  # frames are shown when no identity has come for 0.25 s
     text = f"salient: {listen.bench.address}: no frame of a drive with node number 2 (--node), but of node 0\n"
     if end == "duration":
-        listen.bench.run_for(0.1)
+        listen.bench.run_for(0.15)
     elif end == "interrupt":
         assert process.stdout.readline()  # frames have come
         process.send_signal(signal.SIGINT)
     else:
         listen.bench.simulator.close()
-        early = "closed before --duration-s 0.2 had passed: the drive was stopped"
+        early = "closed before --duration-s 0.5 had passed: the drive was stopped"
         text = f"salient: {listen.bench.address}: the drive's bus {early}\n{text}"
     assert finish(process)[1:] == (text, 1)
 

@@ -160,7 +160,7 @@ def test_arm_shows_challenge_and_response(shell):
     (["stop", "--duration-s", "1"], ["--duration-s"]),
     (["speed", "300", "--duration-s", "0"], ["--duration-s 0"]),
     (["speed", "300", "--node", "8"], ["--node 8"]),
-    (["speed", "300", "--machine", "nonesuch"], ["nonesuch", "saturating"]),
+    (["speed", "300", "--machine", "nonesuch"], ["nonesuch", "no bundled machine of that name; the nearest of "]),
     (["speed", "300", "--can", "vcan0"], ["--can vcan0", "unix:PATH or socketcan:INTERFACE"]),
     (["arm", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus", "no drive answers there"])])
 def test_mistake_is_one_line_and_exit_code_2(monkeypatch, capsys, arguments, texts):

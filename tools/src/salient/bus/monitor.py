@@ -93,7 +93,7 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
             if time_ns < due_ns:
                 continue
             line = shown.line(time_ns)
-            if line and not heard and carrier.machine is None:
+            if line and not heard and carrier.machine is None and not nodes.absent:
                 heard = True
                 print(f"salient: {address}: no DRIVE_IDENTITY within {IDENTITY_WAIT_NS / 1e9:g} s: the signals are "
                       f"those of {carrier.likely}; --machine states another", file=sys.stderr, flush=True)
