@@ -262,7 +262,18 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     visitor.run(0.1)
     assert bench.drive.state == "fault" and page.inner_text("#state") == "fault"
     assert page.inner_text("#fault") == bench.drive.fault.replace("_", " ") != "none"
+    bench.fault("winding_open", phase="a")  # by another client of the bench
+    visitor.run(0.1)
+    listed = page.locator("#active-faults li")
+    assert listed.all_inner_texts() == ["current sensor high rail b End", "winding open a End"]
+    visitor.press("#active-faults li:has-text('winding open') button")
+    visitor.run(0.01)
+    visitor.wait("document.querySelectorAll('#active-faults li').length === 1")
+    assert listed.all_inner_texts() == ["current sensor high rail b End"]
     visitor.press("#end-faults")
+    visitor.run(0.01)
+    visitor.wait("document.querySelectorAll('#active-faults li').length === 0")
+    assert page.is_visible("#no-active-faults")
     visitor.tab("Record")
     visitor.press("#read-record")
     assert visitor.ask("document.querySelectorAll('#record .uplot').length") == 4
@@ -270,12 +281,13 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     assert nothing_is_cut_off(page) == []
     page.screenshot(path=_picture("record"))
     page.click("#record button")
-    visitor.tab("Run")
-    visitor.press("#clear-fault")
+    visitor.tab("Faults")
+    visitor.press("#clear-fault-2")
     visitor.run(0.1)
     assert bench.drive.state == "ready" and page.inner_text("#state") == "ready"
     assert bench.drive.parameters["smc_k"] == 900
 
+    visitor.tab("Run")
     page.fill("#load-torque", "0")
     visitor.press("#load-form button")
     page.fill("#torque-reference", "3")

@@ -24,6 +24,7 @@ COMMANDS: dict[str, dict[str, type]] = {
     "load_torque": {"Nm": float},
     "truth_period": {"us": float},
     "fault": {"kind": str},
+    "end_fault": {"kind": str},
     "end_faults": {},
     "parameters": {},
     "set_parameters": {"values": dict},
@@ -32,7 +33,8 @@ COMMANDS: dict[str, dict[str, type]] = {
     "fault_log": {},
 }
 """Those of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
-_OPTIONAL = {"fault": {"phase": str, "leg": str, "value": object, "duration_s": float}}
+_OPTIONAL = {"fault": {"phase": str, "leg": str, "value": object, "duration_s": float},
+             "end_fault": {"phase": str, "leg": str}}
 
 
 class Malformed(Exception):
@@ -106,6 +108,9 @@ class Commander:
         fault = self._link.rig.fault(kind, duration_s=duration_s, **arguments)
         if duration_s is None:
             self._faults.append(fault)
+
+    def _end_fault(self, kind: str, **places: str) -> None:
+        self._link.rig.clear_fault(kind, **places)
 
     def _end_faults(self) -> None:
         while self._faults:

@@ -456,8 +456,8 @@ export class Client {
         return (coarse && wide) || this.messages.signal("RIG_SET", name);
     }
 
-    /** Begins a fault; value: of its attribute. Without a duration it ends by endFaults. */
-    fault(kinds, { kind, phase, leg, value, duration_s: durationS }) {
+    /** What ends a fault: values of RIG_FAULT, and the definition of its kind. */
+    #endingOf(kinds, { kind, phase, leg }) {
         const definition = kinds.find((each) => each.name === kind);
         if (definition === undefined) {
             throw new Rejected(`no fault '${kind}'`);
@@ -471,6 +471,17 @@ export class Client {
                 places[`${kind}_${name}`] = given;
             }
         }
+        const ending = { kind, ...places };
+        if (definition.attribute !== null) {
+            const { name, minimum } = definition.attribute;
+            ending[`${kind}_${name}`] = Math.max(0, minimum); // without a meaning at the end
+        }
+        return { definition, ending };
+    }
+
+    /** Begins a fault; value: of its attribute. Without a duration it ends by endFault or endFaults. */
+    fault(kinds, { kind, phase, leg, value, duration_s: durationS }) {
+        const { definition, ending } = this.#endingOf(kinds, { kind, phase, leg });
         const { attribute } = definition;
         if (attribute !== null) {
             const good = attribute.choices ? attribute.choices.includes(value)
@@ -480,10 +491,6 @@ export class Client {
                     ?? `${shown(attribute.minimum)} to ${shown(attribute.maximum)} ${attribute.unit}`}`);
             }
         }
-        const ending = { kind, ...places };
-        if (attribute !== null) {
-            ending[`${kind}_${attribute.name}`] = Math.max(0, attribute.minimum); // without a meaning at the end
-        }
         const beginning = attribute === null ? ending : { ...ending, [`${kind}_${attribute.name}`]: value };
         const startUs = Math.ceil(this.timeNs / 1000);
         this.#request("RIG_FAULT", { ...beginning, [kind]: "begins" }, kind);
@@ -492,6 +499,12 @@ export class Client {
         } else {
             this.#request("RIG_FAULT", { ...ending, [kind]: "ends", at_us: startUs + durationS * 1e6 }, kind);
         }
+    }
+
+    /** Ends a fault at its places, whoever has begun it. */
+    endFault(kinds, args) {
+        const { ending } = this.#endingOf(kinds, args);
+        this.#request("RIG_FAULT", { ...ending, [ending.kind]: "ends" }, ending.kind);
     }
 
     endFaults() {

@@ -19,6 +19,7 @@ const ACTIONS = {
     load_torque: (client, { Nm }) => client.set("load_torque_Nm", Nm),
     truth_period: (client, { us }) => client.set("truth_period_us", us),
     fault: (client, args, kinds) => client.fault(kinds, args),
+    end_fault: (client, args, kinds) => client.endFault(kinds, args),
     end_faults: (client) => client.endFaults(),
     set_parameters: (client, { values }) => client.setParameters(values),
     save_parameters: (client) => client.saveParameters(),

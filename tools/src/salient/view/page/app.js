@@ -1,7 +1,7 @@
 // The live page: joins a source of frames with plots, pictures and controls.
 
 import { Charts, csvOf } from "./charts.js";
-import { element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
+import { ActiveFaults, element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
     from "./controls.js";
 import { drawLoops, drawMachine, MachineState } from "./machine.js";
 import { PHASE_COLOURS, PHASE_NAMES } from "./palette.js";
@@ -63,6 +63,7 @@ class Page {
         const act = (name, args) => this.act(name, args);
         makeRun(act, info.machine);
         makeFaults(act, info.faults, info.machine.phases);
+        this.activeFaults = new ActiveFaults(act, this.store, info.faults);
         makeParameters(act);
         makeRecord(act);
         makeSignals(info.databases, SIGNALS_AT_START, (names) => this.choose(names));
@@ -337,6 +338,7 @@ class Page {
             return Number.isFinite(value) ? series.signal.choices[String(value)] || String(value) : "";
         };
         const [state, fault, check] = [this.status, this.fault, this.inhibited].map(name);
+        this.activeFaults.show(at_ns);
         const badge = element("state");
         badge.textContent = state || "no data";
         badge.className = `badge ${state === "run" ? "run" : state === "fault" ? "bad" : ""}`;

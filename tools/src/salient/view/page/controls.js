@@ -125,6 +125,7 @@ export function makeFaults(act, kinds, phases) {
         act("fault", args);
     });
     element("end-faults").addEventListener("click", () => act("end_faults", {}));
+    element("clear-fault-2").addEventListener("click", () => act("clear_fault", {}));
     if (kinds.length) {
         show();
     }
@@ -223,6 +224,49 @@ export function showCursors(marks, list) {
             cell(difference)));
     }
     body.replaceChildren(...rows);
+}
+
+/** The faults of the bench that are present, by the reports of the bench up to a time, each with a button to end it.
+ *  store: of the frames; kinds: as of makeFaults. */
+export class ActiveFaults {
+    constructor(act, store, kinds) {
+        this.act = act;
+        this.kinds = new Map(kinds.map((kind) => [kind.name, kind]));
+        this.reports = ["kind", "phase", "leg", "present"].map((name) => store.watch(`RIG_TRUTH_FAULT.${name}`));
+        this.shown = -1;
+    }
+
+    show(at_ns) {
+        const [kinds, phases, legs, present] = this.reports;
+        const until = kinds ? kinds.indexAt(at_ns + 1) : 0;
+        if (until === this.shown) {
+            return;
+        }
+        this.shown = until;
+        const active = new Map();
+        for (let i = 0; i < until; i++) {
+            const name = kinds.signal.choices[String(kinds.value[i])] || String(kinds.value[i]);
+            const kind = this.kinds.get(name);
+            const args = { kind: name };
+            if (kind && kind.phase) {
+                args.phase = PHASE_NAMES[phases.value[i]].toLowerCase();
+            }
+            if (kind && kind.leg) {
+                args.leg = legs.signal.choices[String(legs.value[i])];
+            }
+            const key = Object.values(args).join(" ");
+            active.delete(key);
+            if (present.value[i]) {
+                active.set(key, args);
+            }
+        }
+        element("active-faults").replaceChildren(...[...active].map(([key, args]) => {
+            const end = make("button", { type: "button", textContent: "End" });
+            end.addEventListener("click", () => this.act("end_fault", args));
+            return make("li", {}, `${key.replaceAll("_", " ")} `, end);
+        }));
+        element("no-active-faults").hidden = active.size > 0;
+    }
 }
 
 /** The record of the last fault, and the log of faults. */
