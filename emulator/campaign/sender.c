@@ -62,13 +62,19 @@ static sender_request_t clearing(const sender_t *sender) {
 
 /* After the faults a client withdraws its request until the drive has left its run: after a bus-off the first frames
  * are out of sequence to the drive, and count for nothing. */
-static bool withdraws(sender_t *sender) {
+static bool is_withdrawing(sender_t *sender) {
     const uint64_t since_us = sender->time_us - sender->world->recovery_us;
     sender->withdrawn = sender->withdrawn || (sender->state != STATE_RUN && since_us > 0);
     if (!sender->withdrawn) {
         sender->running_us = sender->time_us;
     }
     return since_us < RECOVERY_OFF_US || sender->time_us < sender->running_us + WITHDRAWN_US;
+}
+
+/* A lost phase is used again after clear_fault, even where its loss was no fault. */
+static sender_request_t withdrawal(const sender_t *sender) {
+    const bool later = sender->time_us >= sender->world->recovery_us + RECOVERY_OFF_US / 2;
+    return later && sender->withdrawn && has(sender, WORLD_DEGRADED) ? SENDER_CLEAR : SENDER_OFF;
 }
 
 static sender_request_t wanted(sender_t *sender) {
@@ -82,10 +88,8 @@ static sender_request_t wanted(sender_t *sender) {
         sender->phase_us = sender->time_us;
     }
     sender->last_state = sender->state;
-    if (recovers && withdraws(sender)) {
-        /* A lost phase is used again after clear_fault, even where its loss was no fault. */
-        const bool later = sender->time_us >= world->recovery_us + RECOVERY_OFF_US / 2;
-        return later && sender->withdrawn && has(sender, WORLD_DEGRADED) ? SENDER_CLEAR : SENDER_OFF;
+    if (recovers && is_withdrawing(sender)) {
+        return withdrawal(sender);
     }
     const world_event_t *request = active(sender, WORLD_REQUEST);
     if (request && !recovers) {

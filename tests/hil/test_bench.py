@@ -292,8 +292,8 @@ def test_misspelt_attribute_is_rejected_with_the_valid_names(bench):
         bench.drive.speed_rpm = 600
     with pytest.raises(AttributeError, match="no attribute 'stop'"):
         bench.drive.stop = True  # a method
-    with pytest.raises(AttributeError, match="no attribute 'telemtry'; the nearest of .* are telemetry, "):
-        _ = bench.telemtry
+    with pytest.raises(AttributeError, match="no attribute 'telemetri'; the nearest of .* are telemetry, "):
+        _ = bench.telemetri
     with pytest.raises(AttributeError, match="no attribute 'lowest_speed'; the nearest of .* are lowest_speed_rpm, "):
         _ = bench.drive.lowest_speed
 
@@ -317,8 +317,8 @@ def test_misspelt_signal_names_the_nearest(bench):
 
 
 def test_misspelt_option_names_the_nearest(make_bench):
-    with pytest.raises(UsageError, match="bench option 'controler': no such option; .* are controller, "):
-        make_bench(controler="paper")
+    with pytest.raises(UsageError, match="bench option 'contlr': no such option; .* are controller, "):
+        make_bench(contlr="paper")
 
 
 def test_bench_variables_are_those_of_the_database(bench):
