@@ -260,6 +260,18 @@ def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, 
     return found
 
 
+def host_targets(command: str, target: str) -> list[str]:
+    """The programs of the host build that a command runs; empty: all."""
+    if command == "test":
+        return []
+    targets = ["salient_host"]
+    targets += ["plant_benchmarks"] if command == "benchmark" else []
+    targets += ["salient_campaign"] if command in ("campaign", "replay") else []
+    targets += ["salient_reference"] if command == "compare" else []
+    targets += ["salient_target"] if target != "host" else []
+    return targets
+
+
 def main() -> int:
     """Reads the command line, prepares, and executes the command in place of this process."""
     options = make_parser().parse_args()
@@ -279,12 +291,7 @@ def main() -> int:
         install_packages(dependencies(options, target), install)
         make_environment(install)
         if needs_build(options):
-            targets = ["salient_host"]
-            targets += ["plant_benchmark_saturating"] if options.command == "benchmark" else []
-            targets += ["salient_campaign"] if options.command in ("campaign", "replay") else []
-            targets += ["salient_reference"] if options.command == "compare" else []
-            targets += ["salient_target"] if target != "host" else []
-            was_built = build("host", [] if options.command == "test" else targets)
+            was_built = build("host", host_targets(options.command, target))
             if target != "host":
                 was_built |= build(target, [])
             if _needs_wasm(options):

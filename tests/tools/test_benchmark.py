@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,9 @@ from reference_plant import Run, machine_from, run_reference
 from salient.benchmark import callgrind
 from salient.benchmark import command as benchmark
 from salient.benchmark.solvers import PLANT, REFERENCE_SOLVERS, REFERENCE_TOLERANCE
-from salient.benchmark.switching_pattern import SwitchingPattern, deviation, record, run_plant
+from salient.benchmark.switching_pattern import SwitchingPattern, deviation, program, record, run_plant
 from salient.machine.file import load_machine
-from salient.paths import MACHINES
+from salient.paths import BUILD, MACHINES, ROOT
 from salient.reference.scipy_plant import dop853, run_scipy
 
 PERIODS = 800  # 20 ms, two and a half strokes
@@ -160,3 +162,14 @@ fn=(2)
 @pytest.mark.parametrize("condition", [name for name in benchmark.CONDITIONS if name != "cortex-m4"])
 def test_each_condition_can_be_measured(condition: str) -> None:
     assert benchmark.measure("paper", condition) > 0.0
+
+
+def test_the_command_builds_the_programs_that_it_runs() -> None:
+    """The suite builds everything before: in a fresh clone it ended for want of one."""
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import launcher; print(*launcher.host_targets(*sys.argv[2:]))"
+    targets = subprocess.run([sys.executable, "-c", code, str(ROOT / "tools"), "benchmark", "cortex-m4"],
+                             capture_output=True, text=True, check=True).stdout.split()
+    listed = subprocess.run(["ninja", "-C", str(BUILD / "host"), "-t", "commands", *targets],
+                            capture_output=True, text=True, check=True).stdout.split()
+    for machine in MACHINES.glob("*.toml"):
+        assert str(program(machine.stem).relative_to(BUILD / "host")) in listed
