@@ -123,12 +123,16 @@ bool facts_may_be_deaf(const observation_t *seen) {
            facts_disturbed(seen, DISTURBS_BACKGROUND);
 }
 
+static uint64_t last_of_event_ns(const world_event_t *event) {
+    return (event->end_us > event->begin_us ? event->end_us : event->begin_us) * 1000;
+}
+
 bool facts_may_be_unarmed(const observation_t *seen) {
     for (unsigned i = 0; i < seen->world->events; i++) {
         const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
         if (event != NULL && event->kind == WORLD_SET &&
             (variable_effect(event->what).disturbs & VARIABLE_LOSES_COMMANDS) != 0 &&
-            seen->client.confirmed_ns < (event->end_us > event->begin_us ? event->end_us : event->begin_us) * 1000) {
+            seen->client.confirmed_ns < last_of_event_ns(event)) {
             return true;
         }
     }
@@ -166,12 +170,16 @@ bool facts_runs_by_speed(const observation_t *seen) {
            facts_can_turn(seen);
 }
 
-/* After bus-off a request to run has no effect until it has been withdrawn, or the drive was reset. */
+/* After bus-off, which disturbed frames lead to as well, a request to run has no effect until it has been withdrawn, or
+ * the drive was reset. */
 static bool is_void(const observation_t *seen) {
     for (unsigned i = 0; i < seen->world->events; i++) {
         const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
-        if (event != NULL && event->kind == WORLD_SET && event->what == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER &&
-            seen->client.withdrawn_ns < event->begin_us * 1000 && seen->reset_ns < event->begin_us * 1000) {
+        const bool ends_in_bus_off =
+            event != NULL && event->kind == WORLD_SET &&
+            (event->what == BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER || event->what == BENCH_VARIABLE_FRAME_FAULT);
+        if (ends_in_bus_off && seen->client.withdrawn_ns < last_of_event_ns(event) &&
+            seen->reset_ns < last_of_event_ns(event)) {
             return true;
         }
     }

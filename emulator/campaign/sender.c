@@ -16,8 +16,9 @@
 #define CONFIGURED_US 60000 /* then the client runs the drive, configured or not, */
 #define LIMITED_US 200000   /* with several sessions */
 #define SAVING_US 30000     /* in which a set is written */
-#define RECOVERY_OFF_US 25000
-#define WITHDRAWN_US 12000                  /* of them after the end of the run */
+#define RECOVERY_OFF_US                                                                                                \
+    45000                  /* 30 ms of silence, and three frames: after a bus-off the drive follows the last of them */
+#define WITHDRAWN_US 12000 /* of them after the end of the run */
 #define DUPLICATE_MAX_NS UINT64_C(20000000) /* of a frame, by a disturbed acknowledgement */
 
 static void mix(sender_t *sender, const void *bytes, size_t count) {

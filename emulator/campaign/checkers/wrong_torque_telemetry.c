@@ -24,7 +24,7 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     state_t *state = memory;
     const double torque_Nm = plant_torque_Nm(seen->plant), angle_rad = seen->plant->rotor_angle_rad;
     const bool known = seen->drive.state == STATE_RUN && seen->time_ns > seen->state_ns + SETTLED_NS &&
-                       facts_undisturbed(seen) &&
+                       facts_undisturbed(seen) && facts_frames_are_current(seen) &&
                        facts_speed_rpm(seen) < SPEED_MAX * seen->world->machine->speed_base_rpm;
     if (!known || state->frames == 0) {
         *state = (state_t){.begin_angle_rad = angle_rad};
