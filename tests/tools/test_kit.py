@@ -35,8 +35,7 @@ class Installed:
 
     def run(self, *command: str | Path, cwd: Path, path: str = "") -> subprocess.CompletedProcess[str]:
         """Runs a command of the environment; path: where other programs are found."""
-        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), "PIP_FIND_LINKS": str(self.wheel.parent),
-                       **environment_of(self.constraints)}
+        environment = {"PATH": f"{self.folder}/bin:{path}".rstrip(":"), **environment_of(self.constraints)}
         return subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True,
                               stdin=subprocess.DEVNULL)
 
@@ -89,7 +88,8 @@ def foreign(installed: Installed, tmp_path_factory: pytest.TempPathFactory) -> P
     root = tmp_path_factory.mktemp("foreign") / "back_calculation"
     shutil.copytree(FOREIGN, root)
     for step in steps(root):
-        done = installed.run("bash", "-euo", "pipefail", "-c", step, cwd=root, path=SYSTEM)
+        given = f"export SALIENT_WHEEL={installed.wheel.as_uri()}\n{step}"
+        done = installed.run("bash", "-euo", "pipefail", "-c", given, cwd=root, path=SYSTEM)
         assert done.returncode == 0, f"{step}\n{done.stdout}\n{done.stderr}"
     assert "7 passed" in done.stdout
     return root
@@ -158,6 +158,26 @@ def test_program_in_the_wheel_has_the_bits_of_the_build(installed, tmp_path):
 
 def test_drive_of_another_repository_passes_its_workflow(foreign):
     assert (foreign / "build" / "report.xml").exists()
+
+
+def test_readme_of_the_other_repository_passes_from_its_folder_alone(installed, tmp_path):
+    root = tmp_path / "copied"
+    shutil.copytree(FOREIGN, root)
+    (tmp_path / "salient" / "out").mkdir(parents=True)
+    shutil.copytree(installed.wheel.parent, tmp_path / "salient" / "out" / "wheel")
+    (block,) = re.findall(r"```\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
+    done = subprocess.run(["/bin/bash", "-euc", block], cwd=root, capture_output=True, text=True,
+                          env={"PATH": SYSTEM, **environment_of(installed.constraints), "HOME": str(tmp_path)},
+                          stdin=subprocess.DEVNULL)
+    assert (done.returncode, "7 passed" in done.stdout) == (0, True), f"{done.stdout}\n{done.stderr}"
+
+
+def test_nothing_installs_the_package_by_a_name_that_anybody_could_claim():
+    """It is on no registry; pip prefers the highest version of any index to one in a folder."""
+    texts = [ROOT / "README.md", ROOT / "tools" / "README.md", ROOT / "tests" / "README.md", *FOREIGN.rglob("*.md"),
+             *FOREIGN.rglob("*.yml"), *(ROOT / "tools" / "src").rglob("*.py")]
+    named = re.compile(r"pip install[^\n]*salient-drive(?![^\n]*@ )")
+    assert [path.name for path in texts if named.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_bug_in_its_law_fails_a_test_that_shows_where(installed, foreign, tmp_path):

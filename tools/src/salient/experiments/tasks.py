@@ -154,7 +154,7 @@ def _on_a_cluster(tasks: Sequence[Task], function: Callable[[Any], Any], address
         import distributed
     except ImportError:
         raise UsageError(f"--scheduler {address}: the package distributed is missing; "
-                         "pip install 'salient-drive[cluster]'") from None
+                         "pip install distributed") from None
     try:
         place = urlsplit(address)
         if place.scheme == "tcp":  # a refusal is known at once; the client would try again for half a minute
