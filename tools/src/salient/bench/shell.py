@@ -19,9 +19,8 @@ import can
 from salient.bench.arming import ArmingSequence, response_to
 from salient.bench.drive import COMMAND_PERIOD_NS
 from salient.bench.session import SILENCE_MAX_S, Session
-from salient.bus.signals import LatestSignals, drive_database, signal_range
+from salient.bus.signals import LatestSignals, signal_range
 from salient.errors import RunFailed, UsageError
-from salient.machine.file import MachineError
 from salient.paths import COMMAND
 
 _LISTEN_S = 0.12
@@ -97,18 +96,19 @@ def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
     actions: dict[str, Callable[[_Shell, Any], int]] = {
         "speed": _run_drive, "torque": _run_drive, "load": _load, "stop": _stop, "clear": _clear, "arm": _arm}
-    try:
-        database = drive_database(options.machine, options.node)
-    except MachineError as error:
-        raise UsageError(str(error)) from None
+    with _Shell(options) as shell:
+        _check_range(shell, options)
+        return actions[options.action](shell, options)
+
+
+def _check_range(shell: _Shell, options: argparse.Namespace) -> None:
+    """UsageError for a reference beyond the range of the machine that the drive carries."""
     if options.action in _REFERENCES:
         message, name = _REFERENCES[options.action]
-        reference = database.get_message_by_name(message).get_signal_by_name(name)
+        reference = shell.drive_database.get_message_by_name(message).get_signal_by_name(name)
         low, high = signal_range(reference)
         if not low <= options.value <= high:
             raise UsageError(f"{options.action} {options.value:g}: must be {low:g} to {high:g} {reference.unit}")
-    with _Shell(options) as shell:
-        return actions[options.action](shell, options)
 
 
 @contextlib.contextmanager
