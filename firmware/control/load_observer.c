@@ -109,7 +109,7 @@ load_observer_inertia_t load_observer_inertia(const load_observer_model_t *model
 }
 
 int64_t load_observer_acceleration(int32_t torque_q24, int32_t inertia_q30) {
-    return fixed_divide((int64_t)torque_q24 << 6, inertia_q30);
+    return fixed_divide((int64_t)torque_q24 * (1 << 6), inertia_q30);
 }
 
 void load_observer_reset(load_observer_t *observer, uint32_t angle) {

@@ -14,6 +14,7 @@
 #include "interrupts/control_step.h"
 #include "interrupts/fault_trace.h"
 #include "interrupts/self_test.h"
+#include "monitors/available_torque.h"
 #include "monitors/flux_monitor.h"
 #include "monitors/stall_monitor.h"
 #include "monitors/sto_monitor.h"
@@ -62,6 +63,7 @@ typedef struct {
     shaft_torque_t shaft_torque;
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
+    available_torque_t available_torque; /* for telemetry */
     thermal_t thermal;
     temperature_t temperature;
     self_test_t self_test;

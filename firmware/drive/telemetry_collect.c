@@ -2,11 +2,11 @@
 
 #include "comms/units.h"
 #include "drive_codec.h"
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "interrupts/deferred.h"
 #include "interrupts/speed_control.h"
 #include "interrupts/torque_control.h"
-#include "monitors/available_torque.h"
 
 /* Gain of the BP-PID in duty per N m, Q15, from duty per scaled error. */
 static uint32_t gain_per_Nm_q15(const drive_t *drive, unsigned gain) {
@@ -67,7 +67,7 @@ static int32_t by_heat_q24(const drive_t *drive) {
     return fixed_min(thermal_q24, drive->temperature.torque_limit_q24);
 }
 
-static void collect_available_torque(const drive_t *drive, drive_telemetry_t *telemetry) {
+COLD available_torque_t telemetry_available_torque(const drive_t *drive) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
     const conduction_state_t *conduction = &control->deferred.conduction;
@@ -87,12 +87,7 @@ static void collect_available_torque(const drive_t *drive, drive_telemetry_t *te
         .by_heat_q24 = by_heat_q24(drive),
         .by_degraded_q24 = drive->degraded.lost != 0 && mean_q24 != 0 ? mean_q24 : INT32_MAX,
     };
-    const available_torque_t available = available_torque(&input);
-    telemetry->available_torque.forward_nm = units_torque_q8(available.forward.torque_q24);
-    telemetry->available_torque.backward_nm = units_torque_q8(-available.backward.torque_q24);
-    telemetry->available_torque.forward_limited_by = available.forward.limited_by;
-    telemetry->available_torque.backward_limited_by = available.backward.limited_by;
-    telemetry->available_torque.load_exceeds = available.load_exceeds;
+    return available_torque(&input);
 }
 
 /* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
@@ -209,7 +204,11 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
 
     collect_estimates(drive, telemetry);
 
-    collect_available_torque(drive, telemetry);
+    telemetry->available_torque.forward_nm = units_torque_q8(drive->available_torque.forward.torque_q24);
+    telemetry->available_torque.backward_nm = units_torque_q8(-drive->available_torque.backward.torque_q24);
+    telemetry->available_torque.forward_limited_by = drive->available_torque.forward.limited_by;
+    telemetry->available_torque.backward_limited_by = drive->available_torque.backward.limited_by;
+    telemetry->available_torque.load_exceeds = drive->available_torque.load_exceeds;
 
     telemetry->identity.firmware_major = SALIENT_VERSION_MAJOR;
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;

@@ -829,7 +829,7 @@ def test_groups_are_listed():
 
 
 def test_unknown_group_is_reported():
-    with pytest.raises(UsageError, match="unknown group dips: the nearest of .* are ripple, .*--list"):
+    with pytest.raises(UsageError, match="unknown group dips: the nearest of .* are dip, .*--list"):
         compare("dips")
 
 

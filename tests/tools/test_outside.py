@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -107,7 +106,8 @@ def test_mistake_in_the_tools_keeps_its_traceback(salient_without_build: Callabl
 
 def test_interrupt_of_the_preparation_is_one_line(tmp_path: Path) -> None:
     """A pip that takes its time, in a copy of what the launcher needs."""
-    code = ("import sys, time; sys.path.insert(0, sys.argv[1]); import launcher, subprocess; "
+    code = ("import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+            "sys.path.insert(0, sys.argv[1]); import launcher, subprocess; "
             "launcher.install_packages = lambda *_: None; "
             "launcher.make_environment = lambda *_: subprocess.run([sys.executable, '-c', "
             "'import time; print(1, flush=True); time.sleep(60)']); "
@@ -115,7 +115,6 @@ def test_interrupt_of_the_preparation_is_one_line(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", code, ROOT / "tools"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           text=True, cwd=tmp_path, start_new_session=True) as launcher:
         assert launcher.stdout.readline() == "1\n"
-        time.sleep(0.1)
         os.killpg(launcher.pid, signal.SIGINT)
         errors = launcher.communicate()[1]
     assert launcher.returncode == 130

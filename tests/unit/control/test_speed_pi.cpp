@@ -136,7 +136,7 @@ TEST(SpeedPi, follows_the_torque_of_another_law_exactly) {
     const speed_pi_parameters_t parameters = parameters_of(8.0, 400.0, -120.0, 120.0);
     std::mt19937 random(4);
     for (int i = 0; i < 100000; i++) {
-        const int32_t torque_q24 = int32_t(random() % (240u << 24)) - (120 << 24);
+        const int32_t torque_q24 = int32_t(int64_t(random() % (240u << 24)) - (120 << 24));
         speed_pi_t pi{int64_t(random())};
         speed_pi_follow(&pi, torque_q24);
         ASSERT_EQ(speed_pi_step(&parameters, &pi, 0), torque_q24);

@@ -101,6 +101,8 @@ def monitor(address: str, every_s: float, duration_s: float | None, machine: str
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
             due_ns += round(every_s * 1e9)
+    except KeyboardInterrupt:
+        pass
     except _BusClosed as end:
         closed = str(end)
     return _finish(address, duration_s, closed, nodes)
