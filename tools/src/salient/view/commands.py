@@ -33,8 +33,10 @@ COMMANDS: dict[str, dict[str, type]] = {
     "fault_log": {},
 }
 """Those of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
-_OPTIONAL = {"fault": {"phase": str, "leg": str, "value": object, "duration_s": float},
-             "end_fault": {"phase": str, "leg": str}}
+_OPTIONAL: dict[str, dict[str, type]] = {
+    "fault": {"phase": str, "leg": str, "value": object, "duration_s": float},
+    "end_fault": {"phase": str, "leg": str},
+}
 
 
 class Malformed(Exception):
