@@ -297,6 +297,21 @@ def test_unknown_or_ambiguous_signal_is_one_line_with_the_nearest(salient_withou
     assert all(word in result.stderr for word in [f"--signals {name}: ", *words]), result.stderr
 
 
+@pytest.mark.parametrize("controller", ["paper", "salient"])
+def test_monitor_names_the_direction_of_the_torque_that_would_hold_the_load(make_bench, controller):
+    """One quadrant has no torque backwards, but this load is beyond the torque forwards."""
+    bench = make_bench(controller=controller)
+    bench.drive.speed_reference_rpm = 600
+    bench.run_for(0.5)
+    bench.rig.load_torque_Nm = 25
+    bench.run_until(lambda: bench.telemetry["DRIVE_AVAILABLE_TORQUE.load_exceeds"].last, timeout=0.3)
+    shown = monitor._MainSignals(monitor.drive_database("saturating"))
+    for time_ns, message in bench.log:
+        shown.add(time_ns, message)
+    assert "load exceeds the torque forward, 19.1" in shown.line(bench.time_ns)
+    assert shown.line(bench.time_ns) == ""
+
+
 def test_monitor_tells_that_a_load_exceeds_the_torque_and_what_limits_it(make_bench):
     bench = make_bench(machine="finite_element", controller="salient")
     bench.drive.speed_reference_rpm = 600

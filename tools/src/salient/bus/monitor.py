@@ -243,23 +243,14 @@ class _MainSignals:
     def add(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame."""
         self._telemetry.add(time_ns, message)
-        if self._telemetry.count("DRIVE_AVAILABLE_TORQUE"):
-            self._exceeded = self._exceeding()
-
-    def _exceeding(self) -> str:
-        available = {name: self._telemetry[f"DRIVE_AVAILABLE_TORQUE.{name}"] for name in (
-            "load_exceeds", "forward_Nm", "backward_Nm", "forward_limited_by", "backward_limited_by")}
-        if available["load_exceeds"].last_name != "yes":
-            return ""
-        side = min(("forward", "backward"), key=lambda side: abs(available[f"{side}_Nm"].last))
-        return (f"load exceeds the torque {side}, {available[f'{side}_Nm'].last:.2f} N m by "
-                f"{available[f'{side}_limited_by'].last_name}")
 
     def line(self, time_ns: int) -> str:
         """The values at a time; empty when the drive has sent none since the last line."""
         telemetry, self._telemetry = self._telemetry, SignalTable(self._database, "DRIVE")
         if not telemetry.count("DRIVE_TORQUE"):
             return ""
+        if telemetry.count("DRIVE_AVAILABLE_TORQUE"):  # comes less often than lines may
+            self._exceeded = _exceeding(telemetry)
         cells = [f"{time_ns * 1e-9:10.4f} s"]
         for title, name, number_format in _COLUMNS:
             value = telemetry[name]
@@ -271,3 +262,13 @@ class _MainSignals:
         if self._exceeded:
             cells.append(self._exceeded)
         return "  ".join(cells)
+
+
+def _exceeding(telemetry: SignalTable) -> str:
+    """The direction in which the load exceeds the torque, which is that of the torque that would hold it; empty when it
+    does not."""
+    if telemetry["DRIVE_AVAILABLE_TORQUE.load_exceeds"].last_name != "yes":
+        return ""
+    side = "forward" if telemetry["load_torque_estimate_Nm"].last > 0.0 else "backward"
+    available, limit = (telemetry[f"DRIVE_AVAILABLE_TORQUE.{side}_{name}"] for name in ("Nm", "limited_by"))
+    return f"load exceeds the torque {side}, {available.last:.2f} N m by {limit.last_name}"

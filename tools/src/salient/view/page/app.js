@@ -43,6 +43,7 @@ class Page {
         this.available = [["forward", "+"], ["backward", "\u2212"]].map(([side, sign]) =>
             ({ sign, torque: available(`${side}_Nm`), limit: available(`${side}_limited_by`) }));
         this.exceeds = available("load_exceeds");
+        this.load = this.store.watch("DRIVE_TORQUE.load_torque_estimate_Nm");
         this.hash = this.store.watch("DRIVE_IDENTITY.dbc_hash");
         this.health = { at_ms: performance.now(), frames: 0, drawn: 0 };
         this.free_ms = 0;
@@ -344,8 +345,8 @@ class Page {
         badge.className = `badge ${state === "run" ? "run" : state === "fault" ? "bad" : ""}`;
         const sides = this.available.map(({ sign, torque, limit }) =>
             ({ torque: Math.abs(torque.at(at_ns)), limit: name(limit), sign }));
-        const least = sides[0].torque < sides[1].torque ? sides[0] : sides[1];
-        const beyond = state === "run" && name(this.exceeds) === "yes" ? `load exceeds torque, ${least.limit}` : "";
+        const against = sides[this.load.at(at_ns) > 0 ? 0 : 1]; // the direction of the torque that would hold the load
+        const beyond = state === "run" && name(this.exceeds) === "yes" ? `load exceeds torque, ${against.limit}` : "";
         const because = state === "fault" ? fault : state === "initialise" && check !== "none" ? check : beyond;
         element("available").textContent = sides.every((side) => Number.isFinite(side.torque))
             ? `Available torque: ${sides.map(({ sign, torque, limit }) =>
