@@ -228,9 +228,12 @@ double facts_torque_max_Nm(const observation_t *seen) {
     return seen->world->machine->torque_max_Nm * (limited != NULL ? limited->value : 1.0);
 }
 
+double facts_inertia_kg_m2(const observation_t *seen) {
+    return seen->plant->machine->inertia_kg_m2 * seen->world->inertia_gain;
+}
+
 double facts_needed_s(const observation_t *seen, double change_rad_s) {
-    return seen->plant->machine->inertia_kg_m2 * seen->world->inertia_gain * change_rad_s /
-           (0.5 * facts_torque_max_Nm(seen));
+    return facts_inertia_kg_m2(seen) * change_rad_s / (0.5 * facts_torque_max_Nm(seen));
 }
 
 double facts_limit_Nm(const observation_t *seen, const uint8_t data[8]) {
@@ -257,12 +260,11 @@ double facts_added_rad_s(const observation_t *seen) {
     const machine_t *machine = seen->plant->machine;
     const double late_s =
         3e-9 * (double)seen->period_ns + OBSERVED_S + seen->largest_flux_Wb / machine->supply_voltage_V;
-    return late_s * seen->world->machine->torque_max_Nm / (machine->inertia_kg_m2 * seen->world->inertia_gain);
+    return late_s * seen->world->machine->torque_max_Nm / facts_inertia_kg_m2(seen);
 }
 
 double facts_uncounted_rad_s(const observation_t *seen) {
     const world_t *world = seen->world;
     const double count_rad = ldexp(TWO_PI, -(int)world->encoder_bits);
-    const double inertia_kg_m2 = seen->plant->machine->inertia_kg_m2 * world->inertia_gain;
-    return sqrt(2.0 * world->machine->torque_max_Nm / inertia_kg_m2 * count_rad);
+    return sqrt(2.0 * world->machine->torque_max_Nm / facts_inertia_kg_m2(seen) * count_rad);
 }

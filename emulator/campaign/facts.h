@@ -99,6 +99,7 @@ uint64_t facts_strokes_ns(const observation_t *seen, double strokes);
 double facts_speed_rpm(const observation_t *seen); /* magnitude */
 double facts_base_rad_s(const observation_t *seen);
 double facts_largest_current_A(const observation_t *seen);
+double facts_inertia_kg_m2(const observation_t *seen);
 
 /* The torque that the drive has at least for a change of the speed, and the time that half of it needs. */
 double facts_torque_max_Nm(const observation_t *seen);

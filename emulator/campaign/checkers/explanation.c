@@ -39,8 +39,8 @@ static bool overloaded(const observation_t *seen) {
     const bool driven_back = !facts_four_quadrants(seen) && plant->speed_rad_s < 0.0 && plant->load_torque_Nm > 0.0;
     const double used_Nm = fabs(plant->load_torque_Nm) + fmax(plant->faults.coulomb_Nm, plant->faults.static_Nm);
     const double change_rad_s = STALL_CHANGE * fabs(seen->client.meant.reference) / RPM_PER_RAD_S;
-    const double inertia_kg_m2 = plant->machine->inertia_kg_m2 * seen->world->inertia_gain;
-    const double needed_Nm = seen->client.meant.torque ? 0.0 : inertia_kg_m2 * change_rad_s / (1e-9 * STALLED_NS);
+    const double needed_Nm =
+        seen->client.meant.torque ? 0.0 : facts_inertia_kg_m2(seen) * change_rad_s / (1e-9 * STALLED_NS);
     return used_Nm + needed_Nm > (driven_back ? LOADED_BACK : LOADED) * torque_left_Nm(seen);
 }
 

@@ -169,9 +169,12 @@ class SignalTable(Mapping[str, Signal]):
 
     def count(self, message_name: str) -> int:
         """Number of frames of a message; KeyError when the node sends none of that name."""
+        return len(self._times[self._key_of(message_name)])
+
+    def _key_of(self, message_name: str) -> tuple[int, bool]:
         for key, message in self._messages.items():
             if message.name == message_name:
-                return len(self._times[key])
+                return key
         raise no_message(message_name, self._messages.values())
 
 
@@ -197,10 +200,7 @@ class LatestSignals(SignalTable):
         return super().__getitem__(name)
 
     def count(self, message_name: str) -> int:
-        for key, message in self._messages.items():
-            if message.name == message_name:
-                return self._counts[key]
-        raise no_message(message_name, self._messages.values())
+        return self._counts[self._key_of(message_name)]
 
 
 def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
