@@ -132,7 +132,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
              "second one opens the switches at once)"),
             ("torque", "NM", "likewise with a torque"),
             ("load", "NM", "set the load torque of the test bench"),
-            ("stop", None, "ramp the drive to zero, in the place of the command that runs it"),
+            ("stop", None, "ramp the drive to zero, taking over from the command that runs it"),
             ("clear", None, "clear a fault"),
             ("arm", None, "arm the drive and let it be, to see that it can be armed; speed and torque do it by "
              "themselves")):

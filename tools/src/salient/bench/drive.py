@@ -157,7 +157,7 @@ class Drive(KnownAttributes):
         self.ask("clear_fault")
 
     def continue_from(self, counter: int) -> None:
-        """The next command follows one with this counter, 0..255: in the place of another sender."""
+        """The next command continues the sequence of another sender, whose last counter this is, 0..255."""
         self._counter = (counter + 1) % 256
 
     def silence(self) -> None:

@@ -501,7 +501,7 @@ export class Client {
         }
     }
 
-    /** Ends a fault at its places, whoever has begun it. */
+    /** Ends a fault at its places, also one that another client has begun. */
     endFault(kinds, args) {
         const { ending } = this.#endingOf(kinds, args);
         this.#request("RIG_FAULT", { ...ending, [ending.kind]: "ends" }, ending.kind);

@@ -97,7 +97,7 @@ export const COMMANDS = {
     load_torque: { Nm: "number" },
     truth_period: { us: "number" }, // of the true state that the test bench sends
     fault: { kind: "string", phase: "string?", leg: "string?", value: "any?", duration_s: "number?" },
-    end_fault: { kind: "string", phase: "string?", leg: "string?" }, // one that anybody has begun
+    end_fault: { kind: "string", phase: "string?", leg: "string?" }, // one of any client
     end_faults: {}, // all that this page has begun
     parameters: {}, // -> [{ name, unit, minimum, maximum, default, value, fraction_bits }]
     set_parameters: { values: "object" }, // by name, as one set: all or none
