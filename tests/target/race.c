@@ -177,8 +177,8 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
     memcpy(telemetry, SNAPSHOT(&from->control), sizeof *telemetry);
 }
 
-available_torque_t telemetry_available_torque(const drive_t *drive) {
-    (void)drive;
+available_torque_t telemetry_available_torque(const drive_t *from) {
+    (void)from;
     return (available_torque_t){0};
 }
 
