@@ -1,5 +1,6 @@
 #include "drive/background_checks.h"
 
+#include "control/conduction.h"
 #include "control/modulator.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -167,6 +168,30 @@ COLD static uint32_t check_flux(drive_t *drive, const flux_sample_t *input) {
     return failed;
 }
 
+/* For telemetry. Words of several moments, because interrupts come in between: each is one word. */
+COLD static available_torque_t find_available_torque(const drive_t *drive, int32_t by_heat_q24) {
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const control_state_t *control = &drive->control;
+    const conduction_state_t *conduction = &control->deferred.conduction;
+    const int32_t speed_q22 = control->observer.speed_q22, mean_q24 = drive->degraded.mean_q24;
+    const bool brakes = parameters->torque_law == TORQUE_LAW_PREDICTIVE && !conduction_at_rest(speed_q22);
+    const available_torque_input_t input = {
+        .run = control->state_machine.state == DRIVE_STATE_RUN,
+        .four_quadrant = parameters->conduction.torque_min_q24 < 0,
+        .speed_q22 = speed_q22,
+        .load_torque_q24 =
+            fixed_add(control->observer.load_torque_q24, deferred_in_effect(control)->speed.periodic_load_q24),
+        .largest_q24 = parameters->conduction.torque_max_q24,
+        .by_voltage_q24 = {conduction->torque_max_q24, -conduction->torque_min_q24},
+        .link_fills = conduction->room_q15 < 1u << 15,
+        .by_link_q24 = brakes ? conduction_braking_q24(&parameters->conduction, control->measurement.dc_link_voltage_q6)
+                              : INT32_MAX,
+        .by_heat_q24 = by_heat_q24,
+        .by_degraded_q24 = drive->degraded.lost != 0 && mean_q24 != 0 ? mean_q24 : INT32_MAX,
+    };
+    return available_torque(&input);
+}
+
 /* Each current is one word: a control interrupt in between changes none while it is read. */
 COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
@@ -174,10 +199,9 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     temperature_step(&parameters->temperature, &drive->temperature, drive->hal, machine_tables.phases, time_us);
     if (thermal_sample(&parameters->thermal, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
         const int32_t thermal_q24 = thermal_torque_limit_q24(&parameters->thermal, &drive->thermal);
-        const int32_t degraded_q24 = degraded_torque_limit_q24(&drive->degraded);
-        const int32_t limit_q24 = thermal_q24 < degraded_q24 ? thermal_q24 : degraded_q24;
-        drive->control.torque_limit_q24 =
-            limit_q24 < temperature->torque_limit_q24 ? limit_q24 : temperature->torque_limit_q24;
+        const int32_t by_heat_q24 = fixed_min(thermal_q24, temperature->torque_limit_q24);
+        drive->control.torque_limit_q24 = fixed_min(by_heat_q24, degraded_torque_limit_q24(&drive->degraded));
+        drive->available_torque = find_available_torque(drive, by_heat_q24);
     }
 }
 

@@ -283,7 +283,6 @@ COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
         arming_end_configuration(&drive->comms.commands.arming);
     }
     drive_telemetry_t values;
-    drive->available_torque = telemetry_available_torque(drive);
     collect_telemetry(drive, time_us, &values);
     comms_telemetry(&drive->comms, drive->hal, &values);
 }

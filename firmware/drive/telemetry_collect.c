@@ -62,34 +62,6 @@ static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry)
         lost ? degraded_torque_q24(&drive->control_parameters.degraded, state, &machine_tables, electrical) : 0);
 }
 
-static int32_t by_heat_q24(const drive_t *drive) {
-    const int32_t thermal_q24 = thermal_torque_limit_q24(&drive->control_parameters.thermal, &drive->thermal);
-    return fixed_min(thermal_q24, drive->temperature.torque_limit_q24);
-}
-
-COLD available_torque_t telemetry_available_torque(const drive_t *drive) {
-    const control_parameters_t *parameters = &drive->control_parameters;
-    const control_state_t *control = &drive->control;
-    const conduction_state_t *conduction = &control->deferred.conduction;
-    const int32_t speed_q22 = control->observer.speed_q22, mean_q24 = drive->degraded.mean_q24;
-    const bool brakes = parameters->torque_law == TORQUE_LAW_PREDICTIVE && !conduction_at_rest(speed_q22);
-    const available_torque_input_t input = {
-        .run = control->state_machine.state == DRIVE_STATE_RUN,
-        .four_quadrant = parameters->conduction.torque_min_q24 < 0,
-        .speed_q22 = speed_q22,
-        .load_torque_q24 =
-            fixed_add(control->observer.load_torque_q24, deferred_in_effect(control)->speed.periodic_load_q24),
-        .largest_q24 = parameters->conduction.torque_max_q24,
-        .by_voltage_q24 = {conduction->torque_max_q24, -conduction->torque_min_q24},
-        .link_fills = conduction->room_q15 < 1u << 15,
-        .by_link_q24 = brakes ? conduction_braking_q24(&parameters->conduction, control->measurement.dc_link_voltage_q6)
-                              : INT32_MAX,
-        .by_heat_q24 = by_heat_q24(drive),
-        .by_degraded_q24 = drive->degraded.lost != 0 && mean_q24 != 0 ? mean_q24 : INT32_MAX,
-    };
-    return available_torque(&input);
-}
-
 /* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
 static void collect_estimates(const drive_t *drive, drive_telemetry_t *telemetry) {
     const int64_t error_q40 = (int64_t)drive->table_scale.resistance_q40 * drive->control_rate_hz;

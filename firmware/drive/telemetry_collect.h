@@ -11,10 +11,6 @@
  * telemetry_dropped, which telemetry_cycle() writes. The control interrupt must not run meanwhile. [background] */
 void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry);
 
-/* Torque that is available now. Not all of one moment: interrupts may come meanwhile, because telemetry_collect, which
- * copies it, would take longer than they leave. [background] */
-available_torque_t telemetry_available_torque(const drive_t *drive);
-
 /* Bits of DRIVE_SELF_TEST: failed temperature sensors, and above them SELF_TEST_*. */
 uint16_t telemetry_self_test(const drive_t *drive);
 

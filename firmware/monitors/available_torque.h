@@ -2,11 +2,13 @@
  *
  * Limits that hold at once are looked at in this order, and the first one of the smallest is named:
  *
- *   current     torque_max_Nm, which is the torque of the current limit
- *   voltage     at this speed (control/conduction.h); not known to controllers of one quadrant
- *   DC link     braking torque whose energy the link takes, with a brake chopper, a supply that takes energy back, or
- * the losses of the windings alone heat        of windings and switches: thermal models and sensors degraded    mean
- * torque of the phases that are left controller  one quadrant has no torque backwards
+ * current: torque_max_Nm, which is the torque of the current limit;
+ * voltage: at this speed (control/conduction.h), not known to controllers of one quadrant;
+ * DC link: braking torque whose energy the link takes, by a brake chopper, a supply that takes energy back, or the
+ * losses of the windings alone;
+ * heat: of windings and switches, by thermal models and sensors;
+ * degraded: mean torque of the phases that are left;
+ * controller: one quadrant has no torque backwards.
  */
 #ifndef MONITORS_AVAILABLE_TORQUE_H
 #define MONITORS_AVAILABLE_TORQUE_H

@@ -177,11 +177,6 @@ void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t 
     memcpy(telemetry, SNAPSHOT(&from->control), sizeof *telemetry);
 }
 
-available_torque_t telemetry_available_torque(const drive_t *from) {
-    (void)from;
-    return (available_torque_t){0};
-}
-
 uint16_t telemetry_self_test(const drive_t *from) {
     (void)from;
     return 0;
