@@ -61,7 +61,8 @@ def test_bus_of_the_drive_only_has_no_frame_of_the_bench_but_replies(request, tm
 SUITE = """
 def test_of_any_drive(bench):
     bench.drive.speed_reference_rpm = 150
-    bench.run_until(lambda: abs(bench.telemetry["speed_rpm"].last - 150) < 5, timeout=600)  # of the client: as long as it takes a slow computer
+    # The client's time, which is not the drive's: as long as a slow computer may need.
+    bench.run_until(lambda: abs(bench.telemetry["speed_rpm"].last - 150) < 5, timeout=600)
     bench.drive.stop()
 
 def test_of_the_bench(bench):
