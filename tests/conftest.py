@@ -15,6 +15,7 @@ from salient.__main__ import main
 from salient.builder import build_preset
 from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.paths import BUILD, ROOT
+from salient.turns import TURNS, turn_of_name
 
 BUILDS = {
     "hil": {"host": ["salient_host"]},
@@ -26,6 +27,32 @@ BUILDS = {
 
 # Tests of the benchmark use the reference model of the plant, too.
 sys.path.append(str(ROOT / "tests" / "plant"))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--turn", type=int, choices=range(TURNS), metavar=f"0..{TURNS - 1}",
+                     help="of the tests that are marked in_turns, those of this turn only; default: all of them")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "in_turns: takes long, and is run with one commit of several (salient.turns)")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves the tests out that have another turn."""
+    turn = config.getoption("--turn")
+    waiting = [] if turn is None else [item for item in items if _turn_of(item) not in (None, turn)]
+    if waiting:
+        config.hook.pytest_deselected(items=waiting)
+        items[:] = [item for item in items if item not in set(waiting)]
+
+
+def _turn_of(item: pytest.Item) -> int | None:
+    """Turn of a marked test; one of all tests of a file that is marked as a whole, because they share its fixtures."""
+    module = item.getparent(pytest.Module)
+    if module is not None and any(mark.name == "in_turns" for mark in module.own_markers):
+        return turn_of_name(module.nodeid)
+    return turn_of_name(item.nodeid) if item.get_closest_marker("in_turns") else None
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

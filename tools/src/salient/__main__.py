@@ -65,7 +65,7 @@ def _demo(options: argparse.Namespace) -> int:
 def _test(options: argparse.Namespace) -> int:
     from salient import test_runner as checks
 
-    return checks.run(options.only)
+    return checks.run(options.only, thorough=options.thorough)
 
 
 def _sim(options: argparse.Namespace) -> int:

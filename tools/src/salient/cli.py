@@ -92,6 +92,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     test = command("test", "all tests; the last line has the numbers of passed and failed")
     test.add_argument("--only", action="append", type=_one_of(TEST_STEPS), metavar="STEP",
                       help=f"one step only, may be repeated: {', '.join(TEST_STEPS)}")
+    test.add_argument("--thorough", action="store_true",
+                      help="all tests that take long, not only those whose turn it is with this commit")
 
     sim = command("sim", "the drive and its test bench until interrupted; prints one JSON line when ready")
     _add_bench_options(sim, "sim")

@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 from salient import builder
 from salient.paths import BUILD, ROOT, SCENARIOS
+from salient.turns import TURNS, turn_of_commit
 
 RESULTS = BUILD / "results"
 TESTS = ROOT / "tests"
@@ -43,8 +44,9 @@ class Count:
         return f"{self.passed} passed, {self.failed} failed"
 
 
-def run(only: list[str] | None) -> int:
-    """Runs all steps, or only the named ones; returns 0 when everything passed, else 1.
+def run(only: list[str] | None, *, thorough: bool = False) -> int:
+    """Runs all steps, or only the named ones; returns 0 when everything passed, else 1. thorough: every turn of the
+    tests that take long, not the commit's alone (salient.turns).
 
     The VM of `socketcan` uses one core: it runs beside the first steps. The folders of Python tests are one run of
     pytest, in which no process waits for the last test of a folder.
@@ -65,7 +67,7 @@ def run(only: list[str] | None) -> int:
             count, duration_s = socketcan.result()
             _print(f"--- socketcan: {count} ({duration_s:.0f} s)")
             total += count
-    total += _python_tests([name for name in names if name in PYTHON_TESTS])
+    total += _python_tests([name for name in names if name in PYTHON_TESTS], None if thorough else turn_of_commit())
     _print(str(total))
     return 1 if total.failed or not total.passed else 0
 
@@ -130,14 +132,17 @@ def _sanitize() -> Count:
     return count
 
 
-def _python_tests(names: list[str]) -> Count:
-    """One run of pytest for the folders of these names, with a line of each."""
+def _python_tests(names: list[str], turn: int | None) -> Count:
+    """One run of pytest for the folders of these names, with a line of each. turn: None for all of them."""
     for name in names:
         _print(f"--- {name}: {PYTHON_TESTS[name]}")
     folders = [TESTS / name for name in names]
     if not folders:
         return Count()
-    count = _pytest("python", *folders)
+    if turn is not None:
+        _print(f"--- turn {turn} of 0 to {TURNS - 1}: the other tests that take long are run by `tools/salient test "
+               "--thorough`")
+    count = _pytest("python", *folders, options=[] if turn is None else [f"--turn={turn}"])
     for folder in folders:
         _print(f"--- {folder.name}: {_read_report(RESULTS / 'python.xml', f'tests.{folder.name}.')}")
     return count
