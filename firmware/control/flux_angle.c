@@ -85,9 +85,7 @@ COLD int32_t flux_angle_solve(const flux_angle_t *flux_angle) {
     }
     unsigned shift = 0;
     for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {
-        while (flux_angle->sum[row][row] >> shift >> SCALED_BITS != 0) {
-            shift++;
-        }
+        shift = fixed_max_u32(shift, fixed_shift_below((uint64_t)flux_angle->sum[row][row], SCALED_BITS));
     }
     int32_t scaled[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES];
     for (unsigned row = 0; row < FLUX_ANGLE_COURSES; row++) {

@@ -7,6 +7,7 @@
 #define ONE_Q30 (1 << 30)
 #define TOLERANCE_Q30 (ONE_Q30 / 80)
 #define GAIN_MAX_Q30 (ONE_Q30 / 12)
+#define SCALED_BITS 30
 
 /* Sums of windows whose variance is the least that counts, from which on the factor is used, and of which the older
  * half is forgotten. */
@@ -14,13 +15,11 @@
 #define WINDOWS_MAX 1024
 
 static int32_t factor_q30(const shaft_torque_t *shaft, int32_t scale_q30) {
-    unsigned shift = 0;
-    while (shaft->variance >> shift >> 30 != 0) {
-        shift++;
-    }
+    const unsigned shift = fixed_shift_below((uint64_t)shaft->variance, SCALED_BITS);
     const int32_t by_energy = (int32_t)((shaft->variance >> shift) * scale_q30 >> 30);
-    const int32_t excess_q30 =
-        fixed_saturate(fixed_divide(((shaft->covariance >> shift) - by_energy) * (INT64_C(1) << 30), by_energy + 1));
+    const int64_t excess =
+        fixed_clamp_64((shaft->covariance >> shift) - by_energy, -(INT64_C(1) << 32), INT64_C(1) << 32);
+    const int32_t excess_q30 = fixed_saturate(fixed_divide(excess * (1 << 30), by_energy + 1));
     const int32_t beyond_q30 = excess_q30 - fixed_clamp(excess_q30, -TOLERANCE_Q30, TOLERANCE_Q30);
     return fixed_abs(excess_q30) > GAIN_MAX_Q30 ? ONE_Q30 : ONE_Q30 + beyond_q30;
 }

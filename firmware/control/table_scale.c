@@ -45,15 +45,12 @@ COLD table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period
 }
 
 static uint64_t magnitude(int64_t value) {
-    return value < 0 ? (uint64_t)-value : (uint64_t)value;
+    return value < 0 ? 0 - (uint64_t)value : (uint64_t)value;
 }
 
 /* Weighted flux linkage over weighted charge, as a resistance times Ts, ohm s, Q-9.40; 0 before the first interval. */
 static int32_t resistance_q40(int64_t flux, int64_t charge) {
-    unsigned shift = 0;
-    while (charge >> shift >> SCALED_BITS != 0) {
-        shift++;
-    }
+    const unsigned shift = fixed_shift_below((uint64_t)charge, SCALED_BITS);
     const int64_t scaled = fixed_clamp_64(flux >> shift, -(INT64_C(1) << 42), INT64_C(1) << 42);
     return fixed_saturate(fixed_divide(scaled * (1 << 20), (charge >> shift) + 1));
 }
@@ -62,12 +59,9 @@ static int32_t resistance_q40(int64_t flux, int64_t charge) {
 static void solve(table_scale_t *scale) {
     const int32_t by_voltage_q40 = resistance_q40(scale->end, scale->charge);
     const int32_t by_table_q40 = resistance_q40(scale->end_table, scale->charge);
-    unsigned shift = 0;
-    while ((magnitude(scale->applied_q30) | magnitude(scale->table_q30) | magnitude(scale->square_q10)) >> shift >>
-               SCALED_BITS !=
-           0) {
-        shift++;
-    }
+    const uint64_t magnitudes =
+        magnitude(scale->applied_q30) | magnitude(scale->table_q30) | magnitude(scale->square_q10);
+    const unsigned shift = fixed_shift_below(magnitudes, SCALED_BITS);
     /* Q10 Q40 to Q30. */
     const int32_t square = (int32_t)(scale->square_q10 >> shift);
     const int64_t applied = (scale->applied_q30 >> shift) - (fixed_product(square, by_voltage_q40) >> 20);

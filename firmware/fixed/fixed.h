@@ -62,6 +62,13 @@ static inline int64_t fixed_clamp_64(int64_t value, int64_t low, int64_t high) {
     return value < low ? low : value;
 }
 
+/* Right shift that brings a magnitude below 2^bits, bits 1..63. Of a negative number, as a sum of squares that has
+ * changed in memory may be, it is that of the largest ones. */
+static inline unsigned fixed_shift_below(uint64_t magnitude, unsigned bits) {
+    const uint64_t above = magnitude >> bits;
+    return above != 0 ? 64u - (unsigned)__builtin_clzll(above) : 0;
+}
+
 /* Saturating sum and difference: one instruction each on a processor with DSP extension, with identical results. */
 static inline int32_t fixed_add(int32_t a, int32_t b) {
 #ifdef __ARM_FEATURE_DSP

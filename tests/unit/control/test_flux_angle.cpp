@@ -12,6 +12,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/flipped_bits.h"
 
 namespace {
 
@@ -180,6 +181,17 @@ TEST_F(FluxAngle, overflows_nothing) {
             }
         }
     }
+}
+
+// A word that has changed in memory: a sum of squares may be negative, and no loop depends on it.
+TEST_F(FluxAngle, is_solved_in_a_bounded_time_with_any_bit_changed) {
+    run(1.5);
+    with_each_bit_flipped(state, [](const flux_angle_t &flipped) { flux_angle_solve(&flipped); });
+    flux_angle_t negative = state;
+    negative.sum[0][0] = -1;
+    EXPECT_EQ(flux_angle_solve(&negative), 0);
+    negative.sum[0][0] = INT64_MIN;
+    EXPECT_EQ(flux_angle_solve(&negative), 0);
 }
 
 } // namespace

@@ -9,6 +9,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/flipped_bits.h"
 
 namespace {
 
@@ -105,6 +106,20 @@ TEST_F(ShaftTorque, follows_a_change_of_the_gain_and_overflows_nothing) {
         shaft_torque_step(&parameters, &state, &sample);
         ASSERT_GT(state.factor_q30, to_fixed(0.9, Q30));
         ASSERT_LT(state.factor_q30, to_fixed(1.1, Q30));
+    }
+}
+
+// A factor beyond 1/12 is none, whatever the sums are.
+TEST_F(ShaftTorque, is_within_its_limits_with_any_bit_of_the_sums_changed) {
+    windows(100, 1.05, 1.0);
+    for (int64_t shaft_torque_t::*sum : {&shaft_torque_t::variance, &shaft_torque_t::covariance}) {
+        with_each_bit_flipped(state.*sum, [&](int64_t flipped) {
+            shaft_torque_t changed = state;
+            changed.*sum = flipped;
+            sample.window++;
+            shaft_torque_step(&parameters, &changed, &sample);
+            EXPECT_NEAR(changed.factor_q30 / Q30, 1.0, 1.0 / 12.0) << flipped;
+        });
     }
 }
 

@@ -13,6 +13,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/flipped_bits.h"
 #include "support/wide_integer.h"
 
 namespace {
@@ -272,6 +273,43 @@ TEST(TableScaleSums, overflow_nothing) {
             ASSERT_GE(state.scale_q30, TABLE_SCALE_MIN_Q30);
             ASSERT_LE(state.scale_q30, TABLE_SCALE_MAX_Q30);
         }
+    }
+}
+
+TEST(TableScaleSums, leave_the_scale_within_its_limits_with_any_bit_changed) {
+    table_scale_t state;
+    table_scale_reset(&state);
+    const auto interval = [](table_scale_t &scale) {
+        for (int k = 0; k < 20; k++) {
+            const table_scale_sample_t sample = {
+                .current_q9 = k == 0 ? 0 : 20 * 512,
+                .flux_q29 = k << 22,
+                .correction_q29 = 0,
+                .table_q29 = k << 22,
+                .periods = 4,
+                .drop_q29 = 0,
+                .zero = k == 0,
+                .none = k == 0,
+                .lost = false,
+            };
+            table_scale_add(&scale, 0, &sample, LEAST_Q9);
+        }
+    };
+    for (unsigned k = 0; k < 2 * TABLE_SCALE_INTERVALS_MIN; k++) {
+        interval(state);
+    }
+    ASSERT_GT(state.table_q30, 0);
+    for (int64_t table_scale_t::*sum :
+         {&table_scale_t::applied_q30, &table_scale_t::table_q30, &table_scale_t::square_q10, &table_scale_t::end,
+          &table_scale_t::end_table, &table_scale_t::charge}) {
+        with_each_bit_flipped(state.*sum, [&](int64_t flipped) {
+            table_scale_t changed = state;
+            changed.*sum = flipped;
+            interval(changed);
+            interval(changed);
+            ASSERT_GE(changed.scale_q30, TABLE_SCALE_MIN_Q30);
+            ASSERT_LE(changed.scale_q30, TABLE_SCALE_MAX_Q30);
+        });
     }
 }
 

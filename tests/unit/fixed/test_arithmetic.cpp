@@ -169,6 +169,16 @@ TEST(FixedArithmetic, magnitudes_and_saturations_to_fewer_bits_are_exact_for_any
     }
 }
 
+TEST(FixedArithmetic, shift_below_is_the_least_that_brings_a_magnitude_below_and_0_for_one_that_is) {
+    for (unsigned bits : {1u, 30u, 63u}) {
+        EXPECT_EQ(fixed_shift_below(0, bits), 0u);
+        EXPECT_EQ(fixed_shift_below((UINT64_C(1) << bits) - 1, bits), 0u);
+        EXPECT_EQ(fixed_shift_below(UINT64_C(1) << bits, bits), 1u);
+        EXPECT_EQ(fixed_shift_below(UINT64_MAX, bits), 64u - bits);
+    }
+    EXPECT_EQ(fixed_shift_below(UINT64_C(5) << 40, 30), 13u);
+}
+
 TEST(FixedArithmetic, products_that_are_shifted_round_as_stated_and_saturate_to_within_their_last_bits) {
     const std::vector<int32_t> values = samples(10, 300);
     const auto expect = [](int32_t result, wide_t exact, unsigned shift) {
