@@ -11,11 +11,13 @@ static void begin(parameter_set_t *set, const parameters_t *parameters, bool def
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         set->values[i] = defaults ? parameters_default(parameters, i) : parameters->values[i];
     }
+    set->sum = parameters_sum(set->values);
 }
 
 void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame) {
     struct drive_parameter_write_t message;
     drive_parameter_write_unpack(&message, frame->data, frame->length);
+    set->sum += (uint32_t)message.value - (uint32_t)set->values[message.index];
     set->values[message.index] = message.value;
     set->written |= UINT64_C(1) << message.index;
     set->crc = crc32_continue(set->crc, frame->data + E2E_HEADER_BYTES, frame->length - E2E_HEADER_BYTES);
@@ -25,6 +27,9 @@ static parameters_verdict_t apply(const parameter_set_t *set, uint32_t crc, para
                                   const parameters_conditions_t *conditions) {
     if (!set->begun || crc != set->crc) {
         return (parameters_verdict_t){PARAMETER_STATUS_INCOMPLETE, 0, 0};
+    }
+    if (set->sum != parameters_sum(set->values)) {
+        return (parameters_verdict_t){PARAMETER_STATUS_MEMORY, 0, 0};
     }
     const parameters_verdict_t verdict = parameters_check(parameters, set->values, set->written, conditions);
     if (verdict.status == PARAMETER_STATUS_DONE) {
@@ -50,7 +55,9 @@ bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *param
     parameters_verdict_t verdict = {armed ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_ARMED, 0, 0};
     const bool begins = step == PARAMETER_SET_STEP_BEGIN || step == PARAMETER_SET_STEP_BEGIN_DEFAULTS;
     if (armed) {
-        if (begins) {
+        if (!parameters_intact(parameters)) {
+            verdict.status = PARAMETER_STATUS_MEMORY;
+        } else if (begins) {
             begin(set, parameters, step == PARAMETER_SET_STEP_BEGIN_DEFAULTS);
         } else if (step == PARAMETER_SET_STEP_APPLY) {
             verdict = apply(set, message.check, parameters, conditions);

@@ -6,7 +6,8 @@
  *   host    PARAMETER_SET_CONTROL apply      with the CRC-32 of all writes, which is wrong when one is missing
  *   drive   PARAMETER_RESPONSE set_control   done, or why not, with the parameters for which the set is refused
  *
- * apply ends the state armed for configuration, whatever its result; so do abandon, and save, which stores the
+ * Parameters in effect or staged that have changed in memory (PARAMETER_STATUS_MEMORY) are neither copied, applied nor
+ * stored. apply ends the state armed for configuration, whatever its result; so do abandon, and save, which stores the
  * parameters in effect. In a run a set may change tunable parameters only (parameters.h).
  */
 #ifndef COMMS_PARAMETER_SET_H
@@ -25,6 +26,7 @@ typedef struct {
     uint32_t crc;     /* of the writes since begin */
     uint64_t written; /* bit i: parameter i */
     int32_t values[PARAMETER_COUNT];
+    uint32_t sum; /* parameters_sum() of them */
 } parameter_set_t;
 
 /* Takes a PARAMETER_WRITE that has passed commands_receive. [background] */

@@ -210,7 +210,7 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
 COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     self_test_t *test = &drive->self_test;
     state_machine_t *state_machine = &drive->control.state_machine;
-    self_test_step(test, drive->hal, &drive->control_parameters, time_us);
+    self_test_step(test, drive->hal, &drive->control_parameters, &drive->parameters, time_us);
     hal_critical_enter(drive->hal);
     if (!self_test_latch_intact(&drive->control)) {
         test->failed |= SELF_TEST_FAULT_LATCH;

@@ -126,11 +126,12 @@ static void check_clock(self_test_t *test, hal_t *hal, uint32_t pass_us) {
     test->clock_reference_us = reference_us;
 }
 
-COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us) {
+COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *constants,
+                         const parameters_t *parameters, uint32_t time_us) {
     for (unsigned i = 0; i < SELF_TEST_LIMIT_WORDS; i++) {
-        test->failed |= word(&parameters->protection, i) != ~test->limit_complement[i] ? SELF_TEST_LIMITS : 0u;
+        test->failed |= word(&constants->protection, i) != ~test->limit_complement[i] ? SELF_TEST_LIMITS : 0u;
     }
-    check_constants(test, parameters);
+    check_constants(test, constants);
     if (test->memory.stack_words > 0 && test->memory.stack[0] != HAL_STACK_UNUSED) {
         test->failed |= SELF_TEST_STACK;
     }
@@ -138,6 +139,9 @@ COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters
         return;
     }
     test->step_us = time_us;
+    if (!parameters_intact(parameters)) {
+        test->failed |= SELF_TEST_PARAMETERS;
+    }
     if (!hal_registers_intact(hal)) {
         test->failed |= SELF_TEST_REGISTERS;
     }
@@ -147,8 +151,8 @@ COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters
 }
 
 COLD uint32_t self_test_faults(const self_test_t *test) {
-    const uint32_t memory =
-        SELF_TEST_LIMITS | SELF_TEST_CONSTANTS | SELF_TEST_FAULT_LATCH | SELF_TEST_STACK | SELF_TEST_REGISTERS;
+    const uint32_t memory = SELF_TEST_LIMITS | SELF_TEST_CONSTANTS | SELF_TEST_FAULT_LATCH | SELF_TEST_STACK |
+                            SELF_TEST_REGISTERS | SELF_TEST_PARAMETERS;
     return ((test->failed & memory) != 0 ? (uint32_t)FAULT_BIT(FAULT_MEMORY) : 0) |
            ((test->failed & SELF_TEST_CODE) != 0 ? (uint32_t)FAULT_BIT(FAULT_CODE) : 0) |
            ((test->failed & SELF_TEST_CLOCK) != 0 ? (uint32_t)FAULT_BIT(FAULT_CLOCK) : 0);

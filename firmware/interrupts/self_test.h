@@ -5,6 +5,7 @@
  *                configured, in 20 calls
  *   fault latch  number, mask and state of the latched fault, which contradict each other when one has changed, and
  *                duties outside of a run, which a changed state has ended, in every call
+ *   parameters   the parameters in effect against their sum, each SELF_TEST_STEP_US
  *   stack        the guard word at its end, in every call; how much of it has never been used, in a second
  *   registers    those of the port, each SELF_TEST_STEP_US
  *   code         the CRC of the program, as a whole at the start and then four words each SELF_TEST_STEP_US
@@ -21,6 +22,7 @@
 #include "interrupts/control_step.h"
 #include "interrupts/state_machine.h"
 #include "monitors/protection.h"
+#include "storage/parameters.h"
 
 #define SELF_TEST_STEP_US 1000u
 #define SELF_TEST_CLOCK_US 10000u
@@ -33,6 +35,7 @@
 #define SELF_TEST_REGISTERS 16u
 #define SELF_TEST_CODE 32u
 #define SELF_TEST_CLOCK 64u
+#define SELF_TEST_PARAMETERS 128u
 #define SELF_TEST_TELEMETRY_BIT 8
 
 #define SELF_TEST_LIMIT_WORDS (sizeof(protection_parameters_t) / sizeof(uint32_t))
@@ -62,7 +65,8 @@ void self_test_configured(self_test_t *test, const control_parameters_t *paramet
 bool self_test_latch_intact(const control_state_t *control);
 
 /* The checks that are due; masks the interrupts while it reads both clocks. [background] */
-void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us);
+void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *constants,
+                    const parameters_t *parameters, uint32_t time_us);
 
 /* Fault mask. */
 uint32_t self_test_faults(const self_test_t *test);

@@ -112,6 +112,11 @@ static void write_fault(nvm_store_t *store, hal_t *hal) {
 
 static void write_parameters(nvm_store_t *store, hal_t *hal, const parameters_t *parameters) {
     nvm_ring_t *ring = &store->parameters;
+    if (!parameters_intact(parameters)) {
+        nvm_ring_abandon(ring, hal);
+        store->saving = NVM_STORE_FAILED;
+        return;
+    }
     if (store->saving_revision != parameters->revision) {
         nvm_ring_abandon(ring, hal);
         store->saving_revision = parameters->revision;

@@ -36,11 +36,29 @@ static const char texts[] =
 
 static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tables have a default of each parameter");
 
+COLD uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]) {
+    uint32_t sum = 0;
+    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
+        sum += (uint32_t)values[i];
+    }
+    return sum;
+}
+
+/* Another one than 0 for memory that has been cleared. */
+static uint32_t sum_of(const parameters_t *parameters) {
+    return ~(parameters_sum(parameters->values) + (uint32_t)parameters->controller_default);
+}
+
+bool parameters_intact(const parameters_t *parameters) {
+    return parameters->sum == sum_of(parameters);
+}
+
 void parameters_init(parameters_t *parameters) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         parameters->values[i] = machine_tables.parameter_default[i];
     }
     parameters->controller_default = machine_tables.parameter_default[PARAMETER_CONTROLLER];
+    parameters->sum = sum_of(parameters);
     parameters->revision = 0;
 }
 
@@ -66,12 +84,14 @@ const char *parameters_unit(unsigned index) {
 
 void parameters_set(parameters_t *parameters, unsigned index, int32_t value) {
     parameters->values[index] = fixed_clamp(value, rows[index].minimum, rows[index].maximum);
+    parameters->sum = sum_of(parameters);
     parameters->revision++;
 }
 
 void parameters_set_controller(parameters_t *parameters, int32_t controller) {
     parameters_set(parameters, PARAMETER_CONTROLLER, controller);
     parameters->controller_default = parameters->values[PARAMETER_CONTROLLER];
+    parameters->sum = sum_of(parameters);
 }
 
 int32_t parameters_default(const parameters_t *parameters, unsigned index) {
@@ -152,6 +172,7 @@ parameters_verdict_t parameters_check(const parameters_t *present, const int32_t
 
 void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
     memcpy(parameters->values, values, sizeof parameters->values);
+    parameters->sum = sum_of(parameters);
     parameters->revision++;
 }
 

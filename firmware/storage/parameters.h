@@ -29,6 +29,7 @@ typedef struct {
 typedef struct {
     int32_t values[PARAMETER_COUNT];
     int32_t controller_default;
+    uint32_t sum;      /* of both: parameters_intact() */
     uint32_t revision; /* incremented by every change, so that derived values can be recomputed */
 } parameters_t;
 
@@ -80,6 +81,12 @@ bool parameters_tunable(unsigned index);
  */
 parameters_verdict_t parameters_check(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                       uint64_t written, const parameters_conditions_t *conditions);
+
+/* Sum of the values of a set, modulo 2^32: another one after a change of any one of them. */
+uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]);
+
+/* False when a value has changed in memory since it was set; such parameters are neither copied nor stored. */
+bool parameters_intact(const parameters_t *parameters);
 
 /* Sets every value at once. */
 void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);

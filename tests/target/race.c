@@ -236,8 +236,9 @@ bool self_test_latch_intact(const control_state_t *control) {
     return true;
 }
 
-void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *parameters, uint32_t time_us) {
-    (void)test, (void)hal, (void)parameters, (void)time_us;
+void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *constants,
+                    const parameters_t *parameters, uint32_t time_us) {
+    (void)test, (void)hal, (void)constants, (void)parameters, (void)time_us;
 }
 
 uint32_t self_test_faults(const self_test_t *test) {

@@ -938,6 +938,50 @@ TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     EXPECT_FALSE(drive.comms.commands.arming.configuring);
 }
 
+// What a set copies, applies and stores has not changed in memory since it was set.
+TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into_effect_nor_stored) {
+    periods(100);
+    const int32_t trip_q9 = drive.control_parameters.protection.current_trip_q9;
+    const std::vector<hal_can_frame_t> sets[] = {frames::parameter_set(9, {{PARAMETER_TORQUE_MAX_NM, 5 << 24}}),
+                                                 {frames::parameter_set_control(9, PARAMETER_SET_STEP_SAVE)}};
+    drive.parameters.values[PARAMETER_CURRENT_TRIP_A] ^= 1 << 11;
+    for (const auto &set : sets) {
+        arm_for_configuration();
+        hal.from_drive.clear();
+        hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+        periods(10);
+        EXPECT_EQ(set_response().status, PARAMETER_STATUS_MEMORY);
+    }
+    EXPECT_EQ(drive.control_parameters.protection.current_trip_q9, trip_q9);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_IDLE);
+    periods(100);
+    EXPECT_EQ(drive.self_test.failed, SELF_TEST_PARAMETERS);
+    command(COMMAND_RUN);
+    run(0.05);
+    EXPECT_TRUE(hal.open);
+    parameter_store_save(&drive.store); // changed after the frame
+    send(COMMAND_OFF);
+    periods(4000);
+    EXPECT_EQ(drive.store.saving, NVM_STORE_FAILED);
+    EXPECT_EQ(drive.store.parameters.sequence, 0u);
+}
+
+TEST_F(Drive, a_staged_value_that_changed_in_memory_is_not_applied) {
+    periods(100);
+    auto set = frames::parameter_set(arm_for_configuration(), {{PARAMETER_TORQUE_MAX_NM, 5 << 24}});
+    const hal_can_frame_t apply = set.back();
+    set.pop_back();
+    hal.to_drive.insert(hal.to_drive.end(), set.begin(), set.end());
+    periods(10);
+    drive.comms.set.values[PARAMETER_CURRENT_TRIP_A] ^= 1 << 11;
+    const parameters_t before = drive.parameters;
+    hal.from_drive.clear();
+    hal.to_drive.push_back(apply);
+    periods(10);
+    EXPECT_EQ(set_response().status, PARAMETER_STATUS_MEMORY);
+    EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
+}
+
 TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
     periods(100);
     std::vector<hal_can_frame_t> recording{frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION)};

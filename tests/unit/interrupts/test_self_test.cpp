@@ -15,6 +15,8 @@ extern "C" {
 #include "storage/fault.h"
 }
 
+#include "support/flipped_bits.h"
+
 struct hal {
     hal_memory_t memory{};
     bool registers_intact = true;
@@ -76,13 +78,14 @@ class SelfTest : public testing::Test {
     }
 
     void begin() {
+        parameters_init(&parameters);
         self_test_init(&test, &hal, time_us);
         self_test_configured(&test, &constants);
     }
 
     void step() {
         hal.time_us = time_us;
-        self_test_step(&test, &hal, &constants, time_us);
+        self_test_step(&test, &hal, &constants, &parameters, time_us);
     }
 
     // Calls until a check fails, `limit_us` at most; the time of the last one since the first.
@@ -100,6 +103,7 @@ class SelfTest : public testing::Test {
     std::array<uint32_t, 3001> code{};
     std::array<uint32_t, 1000> stack{};
     control_parameters_t constants{};
+    parameters_t parameters{};
     self_test_t test{};
     uint32_t time_us = UINT32_MAX - 1000000; // the clock wraps meanwhile
 };
@@ -136,6 +140,21 @@ TEST_F(SelfTest, every_bit_of_the_constants_fails_within_two_passes) {
         bytes[bit / 8] ^= uint8_t(1u << bit % 8);
     }
     EXPECT_LT(2 * pass_us, 2000u);
+}
+
+TEST_F(SelfTest, every_bit_of_the_parameters_fails_within_a_millisecond) {
+    begin();
+    const parameters_t right = parameters;
+    with_each_bit_flipped(right, [&](const parameters_t &flipped) {
+        if (flipped.revision != right.revision) {
+            return; // configures the drive once more, from the same values
+        }
+        begin();
+        parameters = flipped;
+        EXPECT_LE(run(1000000), SELF_TEST_STEP_US);
+        EXPECT_EQ(test.failed, SELF_TEST_PARAMETERS);
+        EXPECT_EQ(self_test_faults(&test), FAULT_BIT(FAULT_MEMORY));
+    });
 }
 
 TEST_F(SelfTest, new_constants_in_the_middle_of_a_pass_are_no_change) {

@@ -299,6 +299,8 @@ TelemetryName = Literal[
     "DRIVE_SELF_TEST.registers",
     "DRIVE_SELF_TEST.code",
     "DRIVE_SELF_TEST.clock",
+    "parameters",
+    "DRIVE_SELF_TEST.parameters",
     "degraded",
     "DRIVE_DEGRADED.degraded",
     "lost_phase_a",

@@ -362,6 +362,9 @@ class Parameters(MutableMapping[str, float]):
             case "excludes_supply":
                 present_V = self._session.telemetry["DRIVE_TORQUE.bus_voltage_V"].last
                 text = f"{row.name} {value(row):g}: excludes the present DC-link voltage, {present_V:.4g} V"
+            case "memory":
+                text = f"{what or ', '.join(wanted)}: a parameter has changed in the drive's memory; reset the drive"
+                prefix = ""
             case "not_while_running":
                 text = "not_while_running" if what else f"{row.name} {value(row):g}: not_while_running"
             case status:
