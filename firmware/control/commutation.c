@@ -1,5 +1,6 @@
 #include "control/commutation.h"
 
+#include "control/phase_map.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
@@ -23,6 +24,29 @@ commutation_parameters_t commutation_configure(const commutation_angles_t *angle
         .active_width = active == stroke ? stroke + 1 : active,
         .available_width = fixed_max_u32(available, active),
     };
+}
+
+COLD bool commutation_drives_forward(const commutation_parameters_t *parameters, const machine_tables_t *tables,
+                                     int32_t current_q9) {
+    int32_t most = 0, least_early = INT32_MAX; /* units of the tables */
+    for (unsigned i = 0; i < COMMUTATION_ANGLES; i++) {
+        commutation_t commutation = {.electrical = parameters->turn_on + i * (parameters->stroke / COMMUTATION_ANGLES)};
+        commutation_find(parameters, &commutation);
+        bool early = false;
+        int32_t torque = 0;
+        for (unsigned phase = 0; phase < parameters->phases; phase++) {
+            if (phase == commutation.active || phase == commutation.outgoing) {
+                const uint32_t angle = commutation_angle(parameters, &commutation, phase);
+                torque += phase_map_torque(tables, angle, current_q9);
+                early = early || phase_map_mirrored(angle);
+            }
+        }
+        most = fixed_max(most, torque);
+        if (early) {
+            least_early = fixed_min(least_early, torque);
+        }
+    }
+    return least_early >= most / 4;
 }
 
 void commutation_find(const commutation_parameters_t *parameters, commutation_t *commutation) {

@@ -13,15 +13,19 @@
 #ifndef CONTROL_COMMUTATION_H
 #define CONTROL_COMMUTATION_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
+#include "control/machine_tables.h"
+#include "fixed/divide.h"
 #include "hal.h"
 
 #define COMMUTATION_NONE HAL_PHASES_MAX
+#define COMMUTATION_ANGLES 64u
 
 /* Angles as parameters set them. */
 typedef struct {
-    uint32_t turn_on;      /* 2^-32 electrical rev, from 2^31 */
+    uint32_t turn_on;      /* 2^-32 electrical rev, from 2^30 */
     uint32_t turn_off;     /* above turn_on; otherwise no phase is active */
     uint32_t outgoing_off; /* from turn_off on */
 } commutation_angles_t;
@@ -42,12 +46,25 @@ typedef struct {
     unsigned outgoing;   /* available phase that entered before it, or that is past its window; or COMMUTATION_NONE */
 } commutation_t;
 
+/* 2^-32 electrical revolution from electrical degrees in Q7; 360 degrees saturate just below one revolution. */
+static inline uint32_t commutation_angle_from_degrees(int32_t degrees_q7) {
+    const int64_t angle = fixed_divide((int64_t)degrees_q7 << 32, 360 * 128);
+    return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
+}
+
 /* Stroke, the angle from one phase to the next: 2^32 / phases, rounded down, 2^-32 electrical rev. phases >= 2. */
 uint32_t commutation_stroke(unsigned phases);
 
 /* Any angles; 2 <= phases <= HAL_PHASES_MAX. */
 commutation_parameters_t commutation_configure(const commutation_angles_t *angles, unsigned phases,
                                                unsigned rotor_poles);
+
+/* False when turn-on is so early that the torque of the phases in use, a phase before its unaligned position among
+ * them, is against the commanded direction, or in it by less than a quarter of the largest: a rotor at rest there would
+ * be driven backwards. Both at a current, A, Q7.9; looked at in COMMUTATION_ANGLES angles of a stroke. Angles that no
+ * phase is in use at have no such torque. [background] */
+bool commutation_drives_forward(const commutation_parameters_t *parameters, const machine_tables_t *tables,
+                                int32_t current_q9);
 
 /* Roles of the phases at the angle `electrical` of phase 0. */
 void commutation_find(const commutation_parameters_t *parameters, commutation_t *commutation);

@@ -33,10 +33,4 @@ static inline int64_t speed_q22_from_rpm(int32_t rpm) {
     return fixed_shift(rpm * PI_30_Q37, 15);
 }
 
-/* 2^-32 electrical revolution from electrical degrees in Q7; 360 degrees saturate just below one revolution. */
-static inline uint32_t angle_from_degrees(int32_t degrees_q7) {
-    const int64_t angle = fixed_divide((int64_t)degrees_q7 << 32, 360 * 128);
-    return angle > UINT32_MAX ? UINT32_MAX : (uint32_t)angle;
-}
-
 #endif

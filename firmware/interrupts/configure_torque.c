@@ -32,7 +32,7 @@ static pwm_ditc_parameters_t duty_from(const configure_source_t *from) {
     return (pwm_ditc_parameters_t){
         .pid = bp_pid_from(values, from->control_rate_hz),
         .current_setpoints =
-            pwm_ditc_setpoints(from->tables, angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
+            pwm_ditc_setpoints(from->tables, commutation_angle_from_degrees(values[PARAMETER_HAND_OVER_ANGLE_DEG])),
         /* Half of the deadbeat gain at standstill: rate / (2 * A/s), in Q24. */
         .incoming_gain_q24 =
             fixed_saturate(fixed_divide((int64_t)from->control_rate_hz << 23, from->tables->current_slew_rate_A_s)),
@@ -88,8 +88,8 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
 static void set_reference_point(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
                                 uint32_t control_rate_hz) {
     const int64_t rise_q9 = fixed_divide((int64_t)tables->current_slew_rate_A_s << 9, control_rate_hz);
-    const uint32_t middle =
-        angle_from_degrees((values[PARAMETER_TURN_ON_ANGLE_DEG] + values[PARAMETER_TURN_OFF_ANGLE_DEG]) / 2);
+    const uint32_t middle = commutation_angle_from_degrees(
+        (values[PARAMETER_TURN_ON_ANGLE_DEG] + values[PARAMETER_TURN_OFF_ANGLE_DEG]) / 2);
     const int32_t flux_q29 =
         phase_map_flux_q29(tables, 0, fixed_clamp(fixed_saturate(rise_q9), 1, PHASE_MAP_CURRENT_MAX_Q9));
     pwm_ditc_set_reference_point(&control->duty, tables, middle, flux_q29 > 0 ? flux_q29 : 1);
@@ -116,12 +116,12 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, const mac
     if (own_windows(values)) {
         return own_sharing_from(values, tables);
     }
-    const uint32_t turn_on = angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
-    const uint32_t turn_off = angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
-    const uint32_t on_early = angle_from_degrees(values[PARAMETER_SHARE_ON_ADVANCE_DEG]);
-    const uint32_t off_early = angle_from_degrees(values[PARAMETER_SHARE_OFF_ADVANCE_DEG]);
+    const uint32_t turn_on = commutation_angle_from_degrees(values[PARAMETER_SHARE_ON_ANGLE_DEG]);
+    const uint32_t turn_off = commutation_angle_from_degrees(values[PARAMETER_SHARE_OFF_ANGLE_DEG]);
+    const uint32_t on_early = commutation_angle_from_degrees(values[PARAMETER_SHARE_ON_ADVANCE_DEG]);
+    const uint32_t off_early = commutation_angle_from_degrees(values[PARAMETER_SHARE_OFF_ADVANCE_DEG]);
     /* Windows overlap by at least 2 degrees, advanced or not; smaller settings are widened. */
-    const uint32_t least = stroke + angle_from_degrees(2 << 7);
+    const uint32_t least = stroke + commutation_angle_from_degrees(2 << 7);
     const uint32_t width = fixed_max_u32(turn_off - turn_on, least);
     const uint32_t narrowing = off_early > on_early ? off_early - on_early : 0;
     return (torque_sharing_parameters_t){
@@ -204,9 +204,9 @@ void configure_torque(control_parameters_t *control, const configure_source_t *f
     control->interleaved_pwm = from->controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2;
     control->commutation = commutation_configure(
         &(commutation_angles_t){
-            .turn_on = angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
-            .turn_off = angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
-            .outgoing_off = angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
+            .turn_on = commutation_angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
+            .turn_off = commutation_angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
+            .outgoing_off = commutation_angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
         },
         from->tables->phases, from->tables->rotor_poles);
     control->hysteresis = (ditc_hysteresis_parameters_t){

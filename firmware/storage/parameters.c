@@ -3,6 +3,7 @@
 #include <assert.h>
 #include <string.h>
 
+#include "control/commutation.h"
 #include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/crc32.h"
@@ -144,6 +145,29 @@ static parameters_verdict_t check_orders(const parameters_t *present, const int3
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }
 
+static uint32_t angle_of(const int32_t values[PARAMETER_COUNT], unsigned index) {
+    return commutation_angle_from_degrees(values[index]);
+}
+
+/* Angles of turn-on and turn-off that are new. */
+static parameters_verdict_t check_direction(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {
+    const commutation_angles_t angles = {
+        .turn_on = angle_of(values, PARAMETER_TURN_ON_ANGLE_DEG),
+        .turn_off = angle_of(values, PARAMETER_TURN_OFF_ANGLE_DEG),
+        .outgoing_off = angle_of(values, PARAMETER_OUTGOING_OFF_ANGLE_DEG),
+    };
+    const bool kept = angles.turn_on == angle_of(present->values, PARAMETER_TURN_ON_ANGLE_DEG) &&
+                      angles.turn_off == angle_of(present->values, PARAMETER_TURN_OFF_ANGLE_DEG) &&
+                      angles.outgoing_off == angle_of(present->values, PARAMETER_OUTGOING_OFF_ANGLE_DEG);
+    const commutation_parameters_t commutation =
+        commutation_configure(&angles, machine_tables.phases, machine_tables.rotor_poles);
+    if (!kept && !commutation_drives_forward(&commutation, &machine_tables, values[PARAMETER_CURRENT_LIMIT_A])) {
+        return (parameters_verdict_t){PARAMETER_STATUS_CONTRADICTION, PARAMETER_TURN_ON_ANGLE_DEG,
+                                      PARAMETER_TURN_OFF_ANGLE_DEG};
+    }
+    return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
+}
+
 /* Of a drive without its supply nothing can be said. */
 static parameters_verdict_t check_supply(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                          int32_t voltage_q6) {
@@ -163,6 +187,9 @@ parameters_verdict_t parameters_check(const parameters_t *present, const int32_t
     parameters_verdict_t verdict = check_each(values, written, conditions->running);
     if (verdict.status == PARAMETER_STATUS_DONE) {
         verdict = check_orders(present, values);
+    }
+    if (verdict.status == PARAMETER_STATUS_DONE) {
+        verdict = check_direction(present, values);
     }
     if (verdict.status == PARAMETER_STATUS_DONE) {
         verdict = check_supply(present, values, conditions->dc_link_voltage_q6);

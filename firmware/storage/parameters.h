@@ -75,7 +75,8 @@ bool parameters_tunable(unsigned index);
  *   PARAMETER_STATUS_NOT_WHILE_RUNNING   in a run, a parameter is written that is not tunable, be it with its present
  *                                        value
  *   PARAMETER_STATUS_CONTRADICTION       a value is not below another one, or is above it; a current limit above the
- *                                        trip only when the limit changes: lowering the trip alone is how it is tested
+ *                                        trip only when the limit changes: lowering the trip alone is how it is tested;
+ *                                        or angles of commutation that can drive backwards (commutation.h)
  *   PARAMETER_STATUS_EXCLUDES_SUPPLY     a threshold of the DC-link voltage changes so that the present voltage, which
  *                                        is within the present thresholds, would fail it
  */

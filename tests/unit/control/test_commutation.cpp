@@ -180,4 +180,24 @@ TEST(Commutation, with_turn_off_before_turn_on_no_phase_is_active) {
     });
 }
 
+// Turn-on before the unaligned position makes torque against the commanded direction until there; the phase before it
+// has to make more.
+TEST(Commutation, drives_forward_unless_a_phase_that_is_turned_on_early_can_drive_the_rotor_back) {
+    const auto drives = [](double on_deg, double off_deg, double outgoing_off_deg, int current_A) {
+        const commutation_angles_t angles = parameters_of(on_deg, off_deg, outgoing_off_deg);
+        const commutation_parameters_t parameters =
+            commutation_configure(&angles, machine_tables.phases, machine_tables.rotor_poles);
+        return commutation_drives_forward(&parameters, &machine_tables, current_A * 512);
+    };
+    for (const int current_A : {1, 20, 52, 79}) {
+        EXPECT_TRUE(drives(180.0, 300.0, 348.0, current_A));
+        EXPECT_TRUE(drives(160.0, 280.0, 348.0, current_A));
+        EXPECT_TRUE(drives(200.0, 250.0, 260.0, current_A)) << "angles without torque, but none back";
+        EXPECT_FALSE(drives(90.0, 359.9, 359.9, current_A));
+        EXPECT_FALSE(drives(120.0, 240.0, 300.0, current_A)) << "as much back as forward";
+        EXPECT_FALSE(drives(156.0, 250.0, 254.0, current_A)) << "the phase before it is off";
+        EXPECT_FALSE(drives(179.0, 250.0, 250.0, current_A));
+    }
+}
+
 } // namespace
