@@ -12,7 +12,7 @@ import zlib
 
 from salient.paths import ROOT
 
-TURNS = 6
+TURNS = 8
 
 
 def turn_of_name(name: str) -> int:
