@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +22,23 @@ def browser() -> Iterator[Browser]:
         launched = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])  # tests run as root
         yield launched
         launched.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., str]]:
+    """Starts `view` with options and returns its link; ends it by an interrupt."""
+    processes = []
+
+    def start(*options: object) -> str:
+        line = [sys.executable, "-m", "salient", "view", *map(str, options)]
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process.stdout.readline().removeprefix("live page: ").strip()
+
+    yield start
+    for process in processes:
+        process.terminate()
+        process.communicate()
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ for (const given of JSON.parse(readFileSync(0, "utf8"))) {
     const same = [];
     const run = new Run({
         messages: new Messages(databasesOf(data, setting.machine), data.data_ids), faults: data.faults,
+        choices: data.parameter_choices,
         onFrame: (timeNs, id, length, bytes) => frames.push(
             [timeNs, id >>> 0, Buffer.from(bytes.slice(0, length)).toString("hex")]),
         onSame: (timeNs, isSame) => same.push([timeNs, isSame]),

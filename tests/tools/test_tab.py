@@ -127,6 +127,23 @@ def test_refused_command_names_what_is_allowed_and_sends_nothing(tab):
     assert len(set(made["hashes"][:5])) == 1
 
 
+def test_values_of_parameters_are_set_linked_and_refused_by_their_names(tab):
+    made, = run_in_tab(tab, {"steps": [
+        to(20), command("set_parameters", values={"controller": "paper", "bp_mode": 1}), command("parameters"),
+        command("set_parameters", values={"controller": "papers"}), command("set_parameters", values={"controller": 7}),
+        command("set_parameters", values={"torque_max_Nm": "paper"}), command("speed_reference", rpm=300), to(100),
+        command("set_parameters", values={"load_source": 1})]})
+    done, read, unknown, beyond, other, _, running = made["answers"]
+    assert done["ok"] and {row["name"]: row["value"] for row in read["value"]}["controller"] == 1
+    assert unknown["message"] == "controller papers: must be traditional, paper or salient"
+    assert beyond["message"] == "controller 7: must be traditional, paper or salient"
+    assert re.fullmatch(r"torque_max_Nm paper: must be 0 to [\d.]+ N m", other["message"])
+    assert running["message"] == "load_source torque_transducer: not_while_running"
+    assert "set_parameters:controller=paper,bp_mode=1;" in made["link"]
+    again, = run_in_tab(tab, {"link": made["link"], "steps": [to(200)]})
+    assert again["same"] == [[made["time_ns"], True]]
+
+
 def test_rewound_run_repeats_to_the_bit_and_another_branch_differs(tab):
     begin = [to(20), command("speed_reference", rpm=300), to(400), command("load_torque", Nm=4), to(700),
              command("fault", kind="current_sensor_gain", phase="a", value=1.1), to(800)]

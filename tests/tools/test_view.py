@@ -9,8 +9,6 @@ import http.server
 import json
 import math
 import random
-import subprocess
-import sys
 import threading
 from collections import Counter
 from itertools import pairwise
@@ -19,6 +17,7 @@ import can
 import numpy as np
 import pytest
 from cantools.database.errors import DecodeError
+from visitor import STEP_S, Visitor, nothing_is_cut_off, picture
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -27,18 +26,13 @@ from salient.bench.drive import DriveError
 from salient.bus.identity import Carrier
 from salient.bus.log import write_logs
 from salient.bus.signals import drive_database, rig_database
-from salient.paths import BUILD, ROOT
+from salient.machine.parameter_table import CHOICES, value_name
+from salient.paths import ROOT
 from salient.view import link as view_link
 from salient.view.command import LogFeed
 from salient.view.commands import COMMANDS
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
-
-STEP_S = 0.04
-"""Less than the time after which the drive misses the commands that the server repeats."""
-PICTURES = BUILD / "view"
-PATIENCE = 2000
-"""Display frames in which a page does what it is asked."""
 
 TWENTY = [
     *(f"DRIVE_STATUS.{name}" for name in ("time_us", "state", "fault", "voltage_saturated", "single_pulse", "cycle")),
@@ -49,83 +43,6 @@ TWENTY = [
     "RIG_TRUTH_MOTION.speed_rpm", "RIG_TRUTH_MOTION.torque_Nm", "RIG_TRUTH_CURRENTS.current_a_A",
     "RIG_TRUTH_BENCH.load_torque_Nm",
 ]
-
-
-@pytest.fixture
-def serve():
-    """Starts `view` with options and returns its link; ends it by an interrupt."""
-    processes = []
-
-    def start(*options):
-        line = [sys.executable, "-m", "salient", "view", *map(str, options)]
-        process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
-        processes.append(process)
-        return process.stdout.readline().removeprefix("live page: ").strip()
-
-    yield start
-    for process in processes:
-        process.terminate()
-        process.communicate()
-
-
-class Visitor:
-    """A person with a page, and the bench whose drive the page shows."""
-
-    def __init__(self, browser, link, bench=None, width=1280, height=800):
-        # Playwright's own functions are evaluated from text, which the page's policy forbids.
-        self.page = browser.new_page(bypass_csp=True, viewport={"width": width, "height": height},
-                                     accept_downloads=True)
-        self.bench = bench
-        self.errors = []
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.goto(link)
-        self.wait("globalThis.salient !== undefined")
-
-    def ask(self, expression):
-        return self.page.evaluate(f"() => {expression}")
-
-    def wait(self, condition):
-        for _ in range(PATIENCE):
-            if self.page.evaluate(f"() => new Promise((done) => requestAnimationFrame(() => done({condition})))"):
-                return
-        raise AssertionError(f"not within {PATIENCE} display frames: {condition}")
-
-    def catch_up(self):
-        self.wait(f"salient.shown_ns >= {self.bench.log[-1][0]}")
-
-    def run(self, duration_s, step_s=STEP_S):
-        """Lets time pass in steps that the page sees one by one."""
-        steps = math.ceil(duration_s / step_s - 1e-9)
-        for _ in range(steps):
-            self.bench.run_for(duration_s / steps)
-            self.catch_up()
-
-    def finish(self):
-        """Lets time pass until the page has the answers to what it has sent."""
-        for count in range(PATIENCE * 10):
-            if not self.ask("salient.pending"):
-                return
-            self.bench.run_for(0.001)
-            if count % 100 == 99:
-                self.catch_up()
-        raise AssertionError("no answer to a command")
-
-    def press(self, selector):
-        self.page.click(selector)
-        self.finish()
-
-    def take_command(self):
-        self.press("#take")
-        self.wait("salient.lease === 'yours'")
-
-    def tab(self, name):
-        self.page.click(f"[role=tab]:text-is('{name}')")
-
-    def notice(self):
-        return self.page.inner_text("#notice")
-
-    def count(self, message):
-        return self.ask(f"salient.store.count('{message}')")
 
 
 @pytest.fixture
@@ -148,18 +65,6 @@ def live(browser, make_bench, serve):
     for visitor in visitors:
         visitor.page.close()
         assert visitor.errors == []
-
-
-def nothing_is_cut_off(page):
-    """Names of visible elements that are beyond the width of the page, or whose text is beyond themselves."""
-    return page.evaluate("""() => [...document.querySelectorAll("body *")].filter((each) => {
-        if (each.closest(".uplot, option, .list, canvas, datalist") || !each.checkVisibility()) { return false; }
-        const box = each.getBoundingClientRect();
-        const beyond = box.right > innerWidth + 0.5 || box.left < -0.5;
-        const cut = each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0
-            && getComputedStyle(each).display !== "inline" && !["SELECT", "INPUT"].includes(each.tagName);
-        return beyond || cut;
-    }).map((each) => `${each.tagName} ${each.id} ${each.className}`)""")
 
 
 def frames_by_message(bench):
@@ -189,12 +94,7 @@ def test_twenty_signals_at_1_kHz_for_ten_seconds_without_a_lost_frame(live):
         shown = visitor.ask(f"(() => {{ const s = salient.store.watch('{name}'); "
                             "return Array.from(s.value.slice(s.size - 9000, s.size)); })()")
         assert np.array_equal(shown, table[name].value[-9000:]), name
-    visitor.page.screenshot(path=_picture("signals"))
-
-
-def _picture(name):
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    return PICTURES / f"{name}.png"
+    visitor.page.screenshot(path=picture("signals"))
 
 
 def torque_of_the_loops(visitor):
@@ -241,7 +141,7 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     page.select_option("#rotor", "slow")
     page.select_option("#window", "0.1")
     visitor.run(0.08)
-    page.screenshot(path=_picture("live"))
+    page.screenshot(path=picture("live"))
     page.select_option("#window", "1")
 
     visitor.tab("Parameters")
@@ -279,7 +179,7 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     assert visitor.ask("document.querySelectorAll('#record .uplot').length") == 4
     assert len(page.query_selector_all("#fault-log tbody tr")) == 1
     assert nothing_is_cut_off(page) == []
-    page.screenshot(path=_picture("record"))
+    page.screenshot(path=picture("record"))
     page.click("#record button")
     visitor.tab("Faults")
     visitor.press("#clear-fault-2")
@@ -310,6 +210,64 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     times = sorted(time for time, value in exported.items() if value)
     assert 990 <= len(times) <= 1001 and {round((b - a) * 1e3) for a, b in pairwise(times)} == {1}
     assert float(exported[times[-1]]) == pytest.approx(bench.telemetry["speed_rpm"].last, abs=1e-6)
+
+
+def test_values_with_names_are_shown_chosen_triggered_and_exported_by_them(live):
+    visitor, bench, page = live(), live.bench, None
+    page = visitor.page
+    visitor.take_command()
+    visitor.tab("Parameters")
+    visitor.press("#read-parameters")
+    for name, names in CHOICES.items():
+        field = page.locator(f"#parameters select[aria-label='{name}']")
+        assert field.locator("option").all_inner_texts() == list(names)
+        assert field.input_value() == value_name(name, bench.drive.parameters[name])
+    assert page.locator("#parameters select").count() == len(CHOICES)
+    page.select_option("#parameters [aria-label=controller]", "paper")
+    page.select_option("#parameters [aria-label=bp_mode]", "fixed_gains")
+    assert page.locator("#parameters tr.changed").count() == 2
+    visitor.press("#apply-parameters")
+    assert visitor.notice() == "" and page.is_disabled("#apply-parameters")
+    assert (bench.drive.parameters["controller"], bench.drive.parameters["bp_mode"]) == (1, 1)
+    visitor.tab("Run")
+    visitor.press("#speed-form button")
+    visitor.run(0.1)
+    visitor.tab("Parameters")
+    page.select_option("#parameters [aria-label=controller]", "traditional")
+    visitor.press("#apply-parameters")
+    assert visitor.notice() == "set parameters: controller traditional: not_while_running"
+    with pytest.raises(DriveError, match="^controller 7: must be traditional, paper or salient$"):
+        bench.drive.parameters["controller"] = 7
+
+    # A drive of a later version may have a value that is not in the table.
+    page.evaluate("""() => { const { command } = salient.source;
+        salient.source.command = async (name, args) => name !== "parameters" ? command.call(salient.source, name, args)
+            : { ok: true, message: "", value: [{ name: "bp_mode", unit: "", minimum: 0, maximum: 9, value: 7 }] }; }""")
+    page.click("#read-parameters")
+    visitor.wait("document.querySelectorAll('#parameters tbody tr').length === 1")
+    assert page.locator("#parameters select").input_value() == "7" and page.is_disabled("#apply-parameters")
+
+    page.evaluate("() => salient.choose(['DRIVE_STATUS.state', 'DRIVE_STATUS.controller'])")
+    page.click("#trigger summary")
+    assert page.is_hidden("#trigger-level")
+    page.select_option("#trigger-choice", "ready")
+    page.select_option("#trigger-mode", "single")
+    page.click("#trigger summary")
+    visitor.tab("Run")
+    visitor.press("#off")
+    visitor.run(1.0)
+    assert bench.drive.state == "ready"
+    states = bench.telemetry["DRIVE_STATUS.state"]
+    stopped_s = states.time_s[np.flatnonzero(states.value == 2)[-1] + 1]
+    assert 0 <= stopped_s - visitor.ask("salient.trigger.shown_ns") / 1e9 < 0.002
+    assert page.locator(".legend output").all_inner_texts() == ["ready", "paper"]
+    assert visitor.ask("salient.charts.plots[0].stateName(1)") == "ready"
+    assert visitor.ask("salient.charts.plots[0].stateName(9)") == ""
+    with page.expect_download() as download:
+        page.click("#export")
+    rows = [line.split(",")[1:] for line in download.value.path().read_text().splitlines()[1:]]
+    assert {("run", "paper"), ("ready", "paper")} <= {tuple(row) for row in rows}
+    assert {value for row in rows for value in row} <= {"run", "ready", "paper", "salient"}
 
 
 def test_cursors_trigger_and_the_part_that_is_dragged(live):
@@ -490,7 +448,7 @@ def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, m
     assert visitor.ask("salient.store.watch('DRIVE_TORQUE.torque_estimate_Nm').size") == (
         bench.telemetry.count("DRIVE_TORQUE"))
     assert nothing_is_cut_off(page) == []
-    page.screenshot(path=_picture("replay"))
+    page.screenshot(path=picture("replay"))
     page.close()
     assert visitor.errors == []
 
@@ -515,7 +473,7 @@ def test_every_tab_is_readable_on_a_phone(live):
     visitor.run(0.4)
     assert nothing_is_cut_off(visitor.page) == []
     visitor.page.evaluate("() => scrollTo(0, 0)")
-    visitor.page.screenshot(path=_picture("phone"), full_page=True)
+    visitor.page.screenshot(path=picture("phone"), full_page=True)
     for name in visitor.page.locator("[role=tab]").all_inner_texts():
         visitor.tab(name)
         assert nothing_is_cut_off(visitor.page) == [], name

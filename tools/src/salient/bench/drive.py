@@ -18,7 +18,9 @@ from salient.bench.parameter_set import ParameterSetWriter, SetResult
 from salient.bus import e2e
 from salient.bus.identity import OtherDatabase
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
+from salient.config import either
 from salient.errors import RunFailed, close_names
+from salient.machine.parameter_table import CHOICES, value_name
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
@@ -351,22 +353,23 @@ class Parameters(MutableMapping[str, float]):
         row, other = rows[result.index], rows[result.other]
         prefix = f"{what}: " if what else ""
 
-        def value(of: ParameterRow) -> float:
-            return wanted[of.name] if of.name in wanted else of.default if what else self[of.name]
+        def value(of: ParameterRow) -> str:
+            number = wanted[of.name] if of.name in wanted else of.default if what else self[of.name]
+            return value_name(of.name, number) or f"{number:g}"
 
         match result.status:
             case "out_of_range":
-                text = f"{row.name} {value(row):g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
+                text = f"{row.name} {value(row)}: must be {_allowed(row)}"
             case "contradiction":
-                text = f"{row.name} {value(row):g}: contradicts {other.name}, {value(other):g} {row.unit}".rstrip()
+                text = f"{row.name} {value(row)}: contradicts {other.name}, {value(other)} {row.unit}".rstrip()
             case "excludes_supply":
                 present_V = self._session.telemetry["DRIVE_TORQUE.bus_voltage_V"].last
-                text = f"{row.name} {value(row):g}: excludes the present DC-link voltage, {present_V:.4g} V"
+                text = f"{row.name} {value(row)}: excludes the present DC-link voltage, {present_V:.4g} V"
             case "memory":
                 text = f"{what or ', '.join(wanted)}: a parameter has changed in the drive's memory; reset the drive"
                 prefix = ""
             case "not_while_running":
-                text = "not_while_running" if what else f"{row.name} {value(row):g}: not_while_running"
+                text = "not_while_running" if what else f"{row.name} {value(row)}: not_while_running"
             case status:
                 text = status if what else f"{', '.join(wanted)}: {status}"
         raise DriveError(prefix + text)
@@ -518,8 +521,14 @@ def raw_value(row: ParameterRow, value: float) -> int:
     """Raw integer of a physical value; DriveError when it exceeds 32 bits."""
     raw = round(math.ldexp(value, row.fraction_bits))
     if not -(2**31) <= raw < 2**31:
-        raise DriveError(f"{row.name} {value:g}: must be {row.minimum:g} to {row.maximum:g} {row.unit}".rstrip())
+        raise DriveError(f"{row.name} {value:g}: must be {_allowed(row)}")
     return raw
+
+
+def _allowed(row: ParameterRow) -> str:
+    """The values of a parameter, by their names where they have them."""
+    names = CHOICES.get(row.name)
+    return either(names) if names else f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
 
 
 def read_parameter_table(session: Client) -> list[ParameterRow]:

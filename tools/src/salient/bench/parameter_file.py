@@ -20,7 +20,7 @@ from salient.bench.drive import ParameterRow, raw_value
 from salient.bench.session import SILENCE_MAX_S, Session
 from salient.config import either
 from salient.errors import UsageError, close_names, shown
-from salient.machine.parameter_table import CHOICES, value_name
+from salient.machine.parameter_table import CHOICES, value_name, value_number
 from salient.toml_file import TextFileError, read_toml
 
 
@@ -103,7 +103,7 @@ def read(path: Path, rows: dict[str, ParameterRow]) -> dict[str, float]:
         entries = read_toml(path)
     except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None
-    entries = {name: _number(name, value) for name, value in entries.items()}
+    entries = {name: value_number(name, value) for name, value in entries.items()}
     mistakes = [f"{path}: {text}" for name, value in entries.items() if (text := _mistake(name, value, rows))]
     for line in mistakes[:-1]:
         print(f"salient: {line}", file=sys.stderr)
@@ -122,12 +122,6 @@ def _mistake(name: str, value: object, rows: dict[str, ParameterRow]) -> str:
         return allowed
     lsb = math.ldexp(1.0, -row.fraction_bits)
     return "" if row.minimum - lsb / 2 <= value <= row.maximum + lsb / 2 else allowed
-
-
-def _number(name: str, value: object) -> object:
-    """The number of a value that is given by its name, else what is given."""
-    names = CHOICES.get(name, ())
-    return names.index(value) if isinstance(value, str) and value in names else value
 
 
 def _allowed(row: ParameterRow) -> str:

@@ -62,6 +62,12 @@ def value_name(name: str, value: float) -> str | None:
     return names[int(value)] if value in range(len(names)) else None
 
 
+def value_number(name: str, value: object) -> object:
+    """The number of a value that is given by its name, else what is given."""
+    names = CHOICES.get(name, ())
+    return names.index(value) if isinstance(value, str) and value in names else value
+
+
 @lru_cache
 def read_table() -> tuple[ParameterDefinition, ...]:
     """All rows of parameters.def, by index."""

@@ -23,9 +23,11 @@ def bundled_machines() -> list[str]:
 
 
 def shared_data() -> dict[str, Any]:
-    """Faults and data IDs, which no machine changes."""
+    """Faults, named values of parameters and data IDs, which no machine changes."""
+    any_machine = description(bundled_machines()[0], 0)
     return {
-        "faults": description(bundled_machines()[0], 0)["faults"],
+        "faults": any_machine["faults"],
+        "parameter_choices": any_machine["parameter_choices"],
         "data_ids": {message.name: e2e.data_id(message) for message in drive_database().messages
                      if "E2EDataId" in attributes(message)},
     }

@@ -13,6 +13,7 @@ from salient.bench.drive import DriveError
 from salient.bench.faults import FaultError, fault_kind
 from salient.bench.rig import Fault, RigError
 from salient.bus.identity import OtherDatabase
+from salient.machine.parameter_table import CHOICES, value_number
 from salient.view.link import Link
 
 COMMANDS: dict[str, dict[str, type]] = {
@@ -53,7 +54,8 @@ def check_command(name: Any, arguments: Any) -> None:
     for key, value in arguments.items():
         if not _is(value, {**optional, **required}[key]):
             raise Malformed
-    if name == "set_parameters" and not all(_is(value, float) for value in arguments["values"].values()):
+    if name == "set_parameters" and not all(_is(value, float) or value in CHOICES.get(parameter, ())
+                                            for parameter, value in arguments["values"].items()):
         raise Malformed
 
 
@@ -122,8 +124,8 @@ class Commander:
         parameters = self._link.drive.parameters
         return [{**asdict(row), "value": parameters[name]} for name, row in parameters.rows.items()]
 
-    def _set_parameters(self, values: dict[str, float]) -> None:
-        self._link.drive.parameters.update(values)
+    def _set_parameters(self, values: dict[str, Any]) -> None:
+        self._link.drive.parameters.update({name: value_number(name, value) for name, value in values.items()})
 
     def _save_parameters(self) -> None:
         self._link.drive.parameters.save()

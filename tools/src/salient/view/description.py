@@ -16,6 +16,7 @@ from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine.drive_data import derive
 from salient.machine.file import MachineError, load_machine, machine_path
+from salient.machine.parameter_table import CHOICES
 
 EXTENDED = 0x80000000
 """Flag of a 29-bit identifier, as in can_id of Linux."""
@@ -23,7 +24,7 @@ _MAP_ANGLES, _MAP_CURRENTS = 61, 41
 
 
 def description(machine: str, node: int) -> dict[str, Any]:
-    """Databases, machine and faults of a drive; UsageError: no such machine."""
+    """Databases, machine, faults and named values of parameters of a drive; UsageError: no such machine."""
     try:
         path = machine_path(machine)
         return {
@@ -32,6 +33,7 @@ def description(machine: str, node: int) -> dict[str, Any]:
             "database_hash": database_hash(drive_database(machine)),
             "machine": machine_of(path),
             "faults": [_fault(kind) for kind in fault_kinds().values()],
+            "parameter_choices": CHOICES,
         }
     except MachineError as error:
         raise UsageError(str(error)) from None

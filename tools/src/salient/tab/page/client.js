@@ -2,6 +2,7 @@
 // is done; what needs an answer lets virtual time pass.
 
 import { HEADER_BYTES, crc32 } from "./e2e.js";
+import { either } from "../../view/page/decoder.js";
 import { rounded } from "./messages.js";
 import { eachFrame, movesTime } from "./world.js";
 
@@ -256,16 +257,20 @@ export class Client {
         return this.rows.map((row) => ({ ...row, value: this.#access("read", row.index)[1] / 2 ** row.fraction_bits }));
     }
 
-    /** Sets parameters by name, all or none; their descriptions have been read. */
-    setParameters(values) {
+    /** Sets parameters by name, all or none; their descriptions have been read. choices: names of values, by parameter. */
+    setParameters(choices, values) {
+        const named = (row, value) => choices[row.name]?.[value] ?? (typeof value === "string" ? value : shown(value));
+        const mustBe = (row, value) => `${row.name} ${named(row, value)}: must be ${either(choices[row.name])
+            ?? `${shown(row.minimum)} to ${shown(row.maximum)} ${row.unit}`}`.trimEnd();
         const writes = Object.entries(values).map(([name, value]) => {
             const row = this.rows.find((each) => each.name === name);
             if (row === undefined) {
                 throw new Rejected(`no parameter '${name}'`);
             }
-            const raw = rounded(value * 2 ** row.fraction_bits);
-            if (!(raw >= -(2 ** 31) && raw < 2 ** 31)) {
-                throw new Rejected(this.#mustBe(row, value));
+            const number = typeof value === "string" ? choices[name]?.indexOf(value) ?? -1 : value;
+            const raw = rounded(number * 2 ** row.fraction_bits);
+            if (!(raw >= -(2 ** 31) && raw < 2 ** 31) || (number < 0 && typeof value === "string")) {
+                throw new Rejected(mustBe(row, value));
             }
             return { row, value, raw };
         });
@@ -276,11 +281,11 @@ export class Client {
         const [row, second] = [this.rows[index], this.rows[other]];
         const value = writes.find((write) => write.row === row)?.value;
         if (status === "out_of_range") {
-            throw new Rejected(this.#mustBe(row, value));
+            throw new Rejected(mustBe(row, value));
         } else if (status === "contradiction") {
-            throw new Rejected(`${row.name} ${shown(value ?? row.default)}: contradicts ${second.name}`);
+            throw new Rejected(`${row.name} ${named(row, value ?? row.default)}: contradicts ${second.name}`);
         } else if (status !== "done") {
-            throw new Rejected(`${value === undefined ? Object.keys(values).join(", ") : `${row.name} ${shown(value)}`}: ${status}`);
+            throw new Rejected(`${value === undefined ? Object.keys(values).join(", ") : `${row.name} ${named(row, value)}`}: ${status}`);
         }
     }
 
@@ -351,10 +356,6 @@ export class Client {
             state: this.messages.signal("DRIVE_STATUS", "state").choices[state] ?? String(state),
             ...Object.fromEntries(physical),
         };
-    }
-
-    #mustBe(row, value) {
-        return `${row.name} ${shown(value)}: must be ${shown(row.minimum)} to ${shown(row.maximum)} ${row.unit}`.trimEnd();
     }
 
     #memory(item) {

@@ -18,10 +18,10 @@ const ACTIONS = {
     clear_fault: (client) => client.clearFault(),
     load_torque: (client, { Nm }) => client.set("load_torque_Nm", Nm),
     truth_period: (client, { us }) => client.set("truth_period_us", us),
-    fault: (client, args, kinds) => client.fault(kinds, args),
-    end_fault: (client, args, kinds) => client.endFault(kinds, args),
+    fault: (client, args, { faults }) => client.fault(faults, args),
+    end_fault: (client, args, { faults }) => client.endFault(faults, args),
     end_faults: (client) => client.endFaults(),
-    set_parameters: (client, { values }) => client.setParameters(values),
+    set_parameters: (client, { values }, { choices }) => client.setParameters(choices, values),
     save_parameters: (client) => client.saveParameters(),
     frame: (client, { id, data }) => client.frame(id, data),
 };
@@ -36,11 +36,11 @@ export const EVENTS = Object.keys(ACTIONS).filter((name) => name !== "frame");
 export const RUN_COMMANDS = [...EVENTS, ...Object.keys(QUERIES)];
 
 export class Run {
-    /** onFrame: as of the client, for frames that are new. onSame(timeNs, same): a hash that was known for this time has
-     *  been compared. */
-    constructor({ messages, faults, onFrame = () => {}, onSame = () => {} }) {
+    /** faults, choices: of an Info. onFrame: as of the client, for frames that are new. onSame(timeNs, same): a hash that
+     *  was known for this time has been compared. */
+    constructor({ messages, faults, choices, onFrame = () => {}, onSame = () => {} }) {
         this.silent = false;
-        this.faults = faults;
+        this.known = { faults, choices };
         this.onSame = onSame;
         this.client = new Client(messages, (...frame) => this.silent || onFrame(...frame));
         this.world = new World((records) => this.client.receive(records));
@@ -87,7 +87,7 @@ export class Run {
             this.ahead = [];
             const event = { timeNs: this.timeNs, name, args };
             this.done.push(event);
-            ACTIONS[name](this.client, args, this.faults);
+            ACTIONS[name](this.client, args, this.known);
             return { ok: true, message: "" };
         } catch (error) {
             if (!(error instanceof Rejected)) {
@@ -138,7 +138,7 @@ export class Run {
         this.#prepare(event.name);
         this.done.push(event);
         try {
-            ACTIONS[event.name](this.client, event.args, this.faults);
+            ACTIONS[event.name](this.client, event.args, this.known);
         } catch (error) {
             if (!(error instanceof Rejected)) {
                 throw error;

@@ -69,6 +69,7 @@ export class TabSource {
         const { machine, database_hash: hash } = data.machines[setting.machine];
         this.run = new Run({
             messages: new Messages(databasesOf(data, setting.machine), data.data_ids), faults: data.faults,
+            choices: data.parameter_choices,
             onFrame: (...frame) => this.columns.add(...frame),
             onSame: (timeNs, same) => this.takeSame(timeNs, same),
         });
@@ -81,7 +82,7 @@ export class TabSource {
         this.lastMs = performance.now();
         return {
             kind: "tab", title: "the drive in this tab", databases: this.run.client.messages.list,
-            database_hash: hash, machine, faults: data.faults,
+            database_hash: hash, machine, faults: data.faults, parameter_choices: data.parameter_choices,
             commands: [...RUN_COMMANDS, "pause", "resume", "step", "rewind"],
             build: `salient ${data.version}, build ${data.build}`, period_ms: 1,
         };

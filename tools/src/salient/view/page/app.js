@@ -3,6 +3,7 @@
 import { Charts, csvOf } from "./charts.js";
 import { ActiveFaults, element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
     from "./controls.js";
+import { textOf } from "./decoder.js";
 import { drawLoops, drawMachine, MachineState } from "./machine.js";
 import { PHASE_COLOURS, PHASE_NAMES } from "./palette.js";
 import { Store } from "./store.js";
@@ -65,7 +66,7 @@ class Page {
         makeRun(act, info.machine);
         makeFaults(act, info.faults, info.machine.phases);
         this.activeFaults = new ActiveFaults(act, this.store, info.faults);
-        makeParameters(act);
+        makeParameters(act, info.parameter_choices);
         makeRecord(act);
         makeSignals(info.databases, SIGNALS_AT_START, (names) => this.choose(names));
         this.choose(SIGNALS_AT_START);
@@ -123,6 +124,20 @@ class Page {
         const list = names.map((name) => this.store.watch(name)).filter(Boolean);
         this.charts.show(list);
         element("trigger-signal").replaceChildren(...list.map((series) => new Option(series.name, series.name)));
+        this.showTriggerLevel();
+    }
+
+    /** The level of the trigger: a number, or a named value that begins or ends. */
+    showTriggerLevel() {
+        const choices = this.store.watch(element("trigger-signal").value)?.signal.choices;
+        element("trigger-level").hidden = Boolean(choices);
+        element("trigger-choice").hidden = !choices;
+        element("trigger-choice").replaceChildren(...Object.entries(choices ?? {}).map(
+            ([number, name]) => new Option(name, number)));
+        const texts = choices ? { rising: "begins", falling: "ends" } : { rising: "rising", falling: "falling" };
+        for (const option of element("trigger-edge").options) {
+            option.textContent = texts[option.value];
+        }
     }
 
     zoom(from_ns, to_ns) {
@@ -153,14 +168,16 @@ class Page {
             this.showHeld();
         });
         const arm = () => {
-            trigger.arm({ mode: element("trigger-mode").value, rising: element("trigger-edge").value === "rising",
-                          series: this.store.watch(element("trigger-signal").value),
-                          level: Number(element("trigger-level").value) }, this.store.last_ns);
+            const series = this.store.watch(element("trigger-signal").value);
+            const level = element(series?.signal.choices ? "trigger-choice" : "trigger-level").value;
+            trigger.arm({ mode: element("trigger-mode").value, rising: element("trigger-edge").value === "rising", series,
+                          level: Number(level) }, this.store.last_ns);
             timeline.held = this.isReplay;
             this.charts.setMark("T", undefined);
             this.showHeld();
         };
-        for (const id of ["trigger-mode", "trigger-signal", "trigger-edge", "trigger-level"]) {
+        element("trigger-signal").addEventListener("change", () => this.showTriggerLevel());
+        for (const id of ["trigger-mode", "trigger-signal", "trigger-edge", "trigger-level", "trigger-choice"]) {
             element(id).addEventListener("change", arm);
         }
         element("export").addEventListener("click", () => this.export());
@@ -336,7 +353,7 @@ class Page {
         const at_ns = this.timeline.held || this.timeline.playing ? this.timeline.end_ns : Infinity;
         const name = (series) => {
             const value = series.at(at_ns);
-            return Number.isFinite(value) ? series.signal.choices[String(value)] || String(value) : "";
+            return Number.isFinite(value) ? textOf(series.signal, value) : "";
         };
         const [state, fault, check] = [this.status, this.fault, this.inhibited].map(name);
         this.activeFaults.show(at_ns);

@@ -1,12 +1,13 @@
 // Plots of signals over time: one for each unit, all over the same time.
 
-import { decimalsOf, textOf } from "./decoder.js";
+import { decimalsOf, nameOf, textOf } from "./decoder.js";
 import { lineStyle } from "./palette.js";
 
 const HEIGHT_MIN = 110;
 const HEIGHT_STACKED = 160; // where the page is one column
 const ONE_COLUMN = matchMedia("(max-width: 900px)"); // as in style.css
 const AXIS_WIDTH = 58;
+const NAME_LENGTH = 9; // of a value's name beside an axis
 const STIMULUS_COLOUR = "#007a58";
 
 /** Minimum and maximum of each column of the plot, in two points a column; the same times for all signals. */
@@ -87,7 +88,7 @@ class Plot {
                 { size: 26, values: (plot, ticks) => ticks.map((tick) => `${+tick.toFixed(6)} s`.replace("-", "−")), space: 90,
                   font: "12px system-ui, sans-serif", stroke: "#333", grid: { stroke: "#e8e8e8", width: 1 },
                   ticks: { size: 4 } },
-                { size: AXIS_WIDTH, label: unit, labelSize: 18, labelGap: 0,
+                { size: AXIS_WIDTH, label: unit, labelSize: states ? 0 : 18, labelGap: 0,
                   font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif", stroke: "#333",
                   grid: { stroke: "#e8e8e8", width: 1 }, ticks: { size: 4 }, space: 26,
                   values: (plot, ticks) => ticks.map((tick) => (states ? this.stateName(tick) : shortNumber(tick))),
@@ -116,8 +117,11 @@ class Plot {
     }
 
     stateName(value) {
-        const choices = this.list[0].signal.choices;
-        return Number.isInteger(value) ? (choices[String(value)] || "") : "";
+        const name = nameOf(this.list[0].signal, value);
+        if (name === undefined) {
+            return this.plot.data.slice(1).some((points) => points.includes(value)) ? String(value) : "";
+        }
+        return name.length > NAME_LENGTH ? `${name.slice(0, NAME_LENGTH - 1)}…` : name; // the legend has all of it
     }
 
     addToLegend(charts, series, style) {
@@ -256,7 +260,7 @@ function drawMark(plot, time_s, name, colour, dash) {
 }
 
 /** The signals from one time to another as CSV: a row for each time at which one of them came, empty where another
- *  did not. Times in seconds, values in the units of the head. */
+ *  did not. Times in seconds, values in the units of the head, or by their names. */
 export function csvOf(list, from_ns, to_ns) {
     const head = ["time_s", ...list.map((series) => series.name + (series.signal.unit ? ` (${series.signal.unit})` : ""))];
     const rows = new Map();
@@ -266,7 +270,8 @@ export function csvOf(list, from_ns, to_ns) {
                 rows.set(series.time[i], new Array(list.length).fill(""));
             }
             const digits = Math.max(decimalsOf(series.signal), 6);
-            rows.get(series.time[i])[column] = String(+series.value[i].toFixed(digits));
+            rows.get(series.time[i])[column] = nameOf(series.signal, series.value[i])
+                ?? String(+series.value[i].toFixed(digits));
         }
     });
     const quoted = (text) => (/[",]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);

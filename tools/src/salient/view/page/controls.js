@@ -131,8 +131,19 @@ export function makeFaults(act, kinds, phases) {
     }
 }
 
-/** The drive's parameters: read, changed, and applied as one set. */
-export function makeParameters(act) {
+/** The field of a parameter with its value as text: names to choose where its values have them. A value without a name
+ *  is there as its number as long as the drive has it. */
+function parameterField(row, choices, text) {
+    const field = choices
+        ? make("select", {}, ...[...new Set([...choices, text])].map((each) => new Option(each, each)))
+        : make("input", { type: "number", step: "any" });
+    field.value = text;
+    field.setAttribute("aria-label", row.name);
+    return field;
+}
+
+/** The drive's parameters: read, changed, and applied as one set. choices: names of values, by parameter. */
+export function makeParameters(act, choices) {
     let rows = [];
     const body = element("parameters").tBodies[0];
     const changed = () => rows.filter((row) => row.input.value !== row.text);
@@ -151,13 +162,14 @@ export function makeParameters(act) {
             return;
         }
         rows = answer.value.map((row) => {
-            const text = plain(row.value);
-            const input = make("input", { type: "number", step: "any", value: text });
-            input.setAttribute("aria-label", row.name);
+            const names = choices[row.name];
+            const text = names?.[row.value] ?? plain(row.value);
+            const input = parameterField(row, names, text);
             input.addEventListener("input", mark);
             const unit = row.unit ? ` ${row.unit}` : "";
-            const line = make("tr", {}, make("th", { scope: "row" }, ...breakable(row.name)), make("td", {}, input),
-                              make("td", { textContent: `${plain(row.minimum)} to ${plain(row.maximum)}${unit}` }));
+            const allowed = names ? [] : [make("td", { textContent: `${plain(row.minimum)} to ${plain(row.maximum)}${unit}` })];
+            const line = make("tr", {}, make("th", { scope: "row" }, ...breakable(row.name)),
+                              make("td", { colSpan: names ? 2 : 1 }, input), ...allowed);
             return { name: row.name, text, input, line };
         });
         body.replaceChildren(...rows.map((row) => row.line));
@@ -168,7 +180,8 @@ export function makeParameters(act) {
     element("parameter-filter").addEventListener("input", filter);
     element("apply-parameters").addEventListener("click", async () => {
         const set = changed();
-        const values = Object.fromEntries(set.map((row) => [row.name, Number(row.input.value)]));
+        const values = Object.fromEntries(set.map((row) => [row.name, row.name in choices ? row.input.value
+            : Number(row.input.value)]));
         const answer = await act("set_parameters", { values });
         if (answer.ok) {
             set.forEach((row) => { row.text = row.input.value; });
@@ -236,16 +249,17 @@ export class ActiveFaults {
         this.shown = -1;
     }
 
-    show(at_ns) {
+    /** Reports so far, each of a fault that begins or ends. */
+    get reported() {
+        return this.reports[0]?.size ?? 0;
+    }
+
+    /** What ends each fault that is present after a number of reports, by its text. */
+    presentAfter(count) {
         const [kinds, phases, legs, present] = this.reports;
-        const until = kinds ? kinds.indexAt(at_ns + 1) : 0;
-        if (until === this.shown) {
-            return;
-        }
-        this.shown = until;
         const active = new Map();
-        for (let i = 0; i < until; i++) {
-            const name = kinds.signal.choices[String(kinds.value[i])] || String(kinds.value[i]);
+        for (let i = 0; i < count; i++) {
+            const name = textOf(kinds.signal, kinds.value[i]);
             const kind = this.kinds.get(name);
             const args = { kind: name };
             if (kind && kind.phase) {
@@ -260,6 +274,16 @@ export class ActiveFaults {
                 active.set(key, args);
             }
         }
+        return active;
+    }
+
+    show(at_ns) {
+        const until = this.reports[0]?.indexAt(at_ns + 1) ?? 0;
+        if (until === this.shown) {
+            return;
+        }
+        this.shown = until;
+        const active = this.presentAfter(until);
         element("active-faults").replaceChildren(...[...active].map(([key, args]) => {
             const end = make("button", { type: "button", textContent: "End" });
             end.addEventListener("click", () => this.act("end_fault", args));

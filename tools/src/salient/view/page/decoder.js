@@ -64,6 +64,15 @@ export function textOf(signal, value) {
     if (!Number.isFinite(value)) {
         return "–";
     }
-    const name = signal.choices && signal.choices[String(Math.round(value))];
-    return name || value.toFixed(decimalsOf(signal)).replace("-", "−");
+    return nameOf(signal, value) ?? value.toFixed(decimalsOf(signal)).replace("-", "−");
+}
+
+/** The name of a value of a signal; undefined where it has none. */
+export function nameOf(signal, value) {
+    return signal.choices?.[String(value)];
+}
+
+/** "a, b or c"; undefined without a list. */
+export function either(list) {
+    return list && [list.slice(0, -1).join(", "), ...list.slice(-1)].filter(Boolean).join(" or ");
 }

@@ -48,6 +48,7 @@
 //     database_hash: number;   // of the drive's DBC above, as DRIVE_IDENTITY.dbc_hash reports it
 //     machine: Machine;
 //     faults: FaultKind[];     // that the test bench knows; empty without one
+//     parameter_choices: { [parameter: string]: string[] };   // names of the values 0, 1, ... of those that select something
 //     commands: string[];      // names of COMMANDS that this source carries out
 //     build: string;           // version, and hash of the build where there is one
 //     period_ms: number;       // of the telemetry at the start, or 0 when unknown
@@ -100,7 +101,7 @@ export const COMMANDS = {
     end_fault: { kind: "string", phase: "string?", leg: "string?" }, // one of any client
     end_faults: {}, // all that this page has begun
     parameters: {}, // -> [{ name, unit, minimum, maximum, default, value, fraction_bits }]
-    set_parameters: { values: "object" }, // by name, as one set: all or none
+    set_parameters: { values: "object" }, // by name, as one set: all or none; numbers, or names of parameter_choices
     save_parameters: {}, // to the memory of the drive
     fault_trace: {}, // -> { time_s[], current_A[][phase], bus_voltage_V[], rotor_angle_deg[], speed_rpm[],
     //                       torque_reference_Nm[], upper_duty[][phase], lower_duty[][phase] }

@@ -91,9 +91,12 @@ export class Trigger {
 
     search(last_ns) {
         const { series, level } = this;
+        const isNamed = Boolean(series.signal.choices); // whose order has no meaning: the value begins or ends
         for (let i = Math.max(1, series.indexAt(this.seen_ns)); i < series.size; i++) {
             const [before, now] = [series.value[i - 1], series.value[i]];
-            if (this.rising ? before < level && now >= level : before > level && now <= level) {
+            const begins = isNamed ? before !== level && now === level : before < level && now >= level;
+            const ends = isNamed ? before === level && now !== level : before > level && now <= level;
+            if (this.rising ? begins : ends) {
                 this.shown_ns = series.time[i];
                 return series.time[i];
             }
