@@ -4,6 +4,7 @@ import { Charts, csvOf } from "./charts.js";
 import { ActiveFaults, element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
     from "./controls.js";
 import { textOf } from "./decoder.js";
+import { FirstRun } from "./first_run.js";
 import { drawLoops, drawMachine, MachineState } from "./machine.js";
 import { PHASE_COLOURS, PHASE_NAMES } from "./palette.js";
 import { Store } from "./store.js";
@@ -76,6 +77,7 @@ class Page {
         element("stop").hidden = !takes;
         element("take").addEventListener("click", () => act(this.lease === "yours" ? "release" : "take", {}));
         this.showLease();
+        this.firstRun = new FirstRun(this);
         document.addEventListener("keydown", (event) => this.takeKey(event));
         requestAnimationFrame((now_ms) => this.tick(now_ms));
     }
@@ -370,6 +372,7 @@ class Page {
                 `${sign}${torque.toFixed(1)} N m (${limit.replaceAll("_", " ")})`).join(", ")}.` : "";
         element("fault").textContent = because.replaceAll("_", " ");
         element("fault").hidden = because === "";
+        this.firstRun.update();
     }
 
     showHealth(now_ms) {
