@@ -97,11 +97,12 @@ def target(visitor):
 
 
 def covered(page):
-    """Controls that the line covers."""
+    """Controls of which the line covers a part."""
     return page.evaluate("""() => [...document.querySelectorAll("button, select, input")].filter((each) => {
         if (!each.checkVisibility() || each.closest("#first-run")) { return false; }
-        const [a, b] = [each.getBoundingClientRect(), document.getElementById("first-run").getBoundingClientRect()];
-        return a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+        const { left, right, top, bottom } = each.getBoundingClientRect();
+        return [0.1, 0.5, 0.9].some((x) => [0.1, 0.5, 0.9].some((y) => document.elementFromPoint(
+            left + x * (right - left), top + y * (bottom - top))?.closest("#first-run")));
     }).map((each) => each.id || each.textContent)""")
 
 

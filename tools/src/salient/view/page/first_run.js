@@ -248,7 +248,7 @@ export class FirstRun {
             this.target.click();
             this.update();
         }
-        this.target?.scrollIntoView({ block: "center" });
+        this.target?.scrollIntoView({ block: "nearest" });
         this.target?.focus();
     }
 }
