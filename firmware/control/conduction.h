@@ -238,8 +238,9 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
     state->latest = CONDUCTION_INITIAL;
 }
 
-/* The next step of the update in progress. Products are rounded down; the level to 2^-15, angles of the tables to
- * 2^-24. */
+/* The next step of the update in progress. Rounded down are the place in the tables, to 2^-8 of the distance of two
+ * points, the level and the part, to 2^-15, of torques to 2^-8 N m, and angles of the tables, to 2^-24 rev; what lies
+ * between two angles, and the limit of the braking torque, is rounded to 4 LSB. */
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state, conduction_update_t *update,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 

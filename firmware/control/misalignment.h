@@ -150,7 +150,8 @@ void misalignment_follow_flux(const misalignment_parameters_t *parameters, misal
 /* Sum of the phases' slopes at their last updates, N m per 0.02 rad, Q7.24, saturates. */
 int32_t misalignment_slope_q24(const misalignment_t *misalignment);
 
-/* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest; sums saturate,
+/* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest, those of low-passes
+ * to 2 LSB, that of misalignment_follow_flux() down; quotients are rounded towards zero, means down; sums saturate,
  * offsets are clamped to +-3.5 of 0.02 rad (4 degrees). */
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample);

@@ -14,6 +14,7 @@ extern "C" {
 }
 
 #include "support/fixed_point.h"
+#include "support/wide_integer.h"
 
 namespace {
 
@@ -489,6 +490,163 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
         ASSERT_LE(state.torque_max_q24, parameters.torque_max_q24);
         ASSERT_GE(angles().half[state.braking].window.overlap, 0x016C16C1u);
     }
+}
+
+// In whole numbers, by the roundings that conduction_step() states. After a reset and without a shortfall the level is
+// that of the torque alone.
+class ConductionRounding : public Conduction {
+  protected:
+    static constexpr wide_integer::wide_t ONE_Q15 = 32768;
+
+    // Of a way between two values, to the nearest 4 LSB; `more`: for the same of what it begins and ends with.
+    static void expect_blend(uint32_t found, uint32_t from, uint32_t to, wide_integer::wide_t part_q15, const char *of,
+                             int more = 0) {
+        const wide_integer::wide_t way_q15 = int32_t(to - from) * part_q15;
+        const wide_integer::wide_t difference_q15 = int32_t(found - from) * ONE_Q15 - way_q15;
+        ASSERT_LE(std::llabs(int64_t(difference_q15)), (2 + more) * 32768) << of;
+    }
+
+    template <typename value_t> int32_t at_q8(value_t low, value_t high) const {
+        return low * 256 + (high - low) * progress.place.fraction_q8;
+    }
+
+    void expect_place(const conduction_sample_t &s) const {
+        using namespace wide_integer;
+        const wide_t speed_q22 = std::abs(s.speed_q22);
+        const wide_t index_q8 =
+            rounded_down(speed_q22 * tables.pulse_index_scale, s.dc_link_voltage_q6 * power_of_2(32));
+        const wide_t limited_q8 = std::min<wide_t>(index_q8, (MACHINE_PULSE_POINTS - 1) * 256);
+        ASSERT_EQ(progress.place.k * 256 + unsigned(progress.place.fraction_q8), unsigned(limited_q8));
+    }
+
+    void expect_pulse() const {
+        const machine_pulse_t *low = &tables.pulse[state.braking][progress.place.k], *high = low + 1;
+        ASSERT_EQ(progress.pulse.lead, uint32_t(at_q8(low->lead, high->lead)) << 8);
+        ASSERT_EQ(progress.pulse.end, uint32_t(at_q8(low->end, high->end)) << 8);
+        ASSERT_EQ(progress.pulse.smooth_q24, at_q8(low->smooth_torque, high->smooth_torque) << 8);
+        ASSERT_EQ(progress.pulse.mean_q24, at_q8(low->mean_torque, high->mean_torque) << 8);
+        ASSERT_EQ(progress.pulse.peak_q24, at_q8(low->peak_torque, high->peak_torque) << 8);
+    }
+
+    // Torques to 2^-8 N m, their quotient to 2^-15.
+    void expect_level_and_part(int32_t magnitude_q24) const {
+        using namespace wide_integer;
+        const conduction_pulse_t &pulse = progress.pulse;
+        const auto q8 = [](int32_t torque_q24) { return rounded_down(torque_q24, 65536); };
+        const auto of_q15 = [](wide_t part, wide_t whole) {
+            return std::clamp<wide_t>(rounded_down(part * ONE_Q15, whole), 0, ONE_Q15);
+        };
+        ASSERT_EQ(state.level_q15,
+                  int32_t(of_q15(q8(magnitude_q24 - pulse.smooth_q24), q8(pulse.mean_q24 - pulse.smooth_q24))));
+        const wide_t part_q15 = of_q15(q8(magnitude_q24), q8(pulse.mean_q24));
+        ASSERT_EQ(state.part_q15, state.partial_q15 > 0 ? int32_t(part_q15) : state.level_q15);
+        const wide_t excess_q8 = 8 * (int32_t(index_q8()) - wide_t(tables.pulse_base_index));
+        ASSERT_EQ(state.partial_q15, int32_t(of_q15(excess_q8, tables.pulse_base_index)));
+    }
+
+    unsigned index_q8() const { return progress.place.k * 256 + unsigned(progress.place.fraction_q8); }
+
+    // Of the machine's windows, 2^-32 rev: to 2^-24.
+    uint32_t window_angle(int32_t magnitude_q24, int16_t machine_sharing_window_t::*side) const {
+        using namespace wide_integer;
+        const wide_t quarters_q8 = rounded_down(magnitude_q24, 65536) * 4 * 256 / tables.sharing_torque;
+        const auto place_q8 = int32_t(std::clamp<wide_t>(quarters_q8 - 256, 0, 3 * 256));
+        const int32_t k = std::min(place_q8 / 256, 2), part_q8 = place_q8 - 256 * k;
+        const auto at = [&](unsigned speed) {
+            const machine_sharing_window_t *of = &tables.sharing[state.braking][speed][k];
+            return of[0].*side * 256 + (of[1].*side - of[0].*side) * part_q8;
+        };
+        const wide_t speed_q8 = std::min(index_q8() * 256 / tables.pulse_base_index, 256u);
+        return uint32_t(int32_t(at(0) + rounded_down((at(1) - at(0)) * speed_q8, 256))) << 8;
+    }
+
+    void expect_positions(int32_t magnitude_q24) const {
+        const uint32_t on = window_angle(magnitude_q24, &machine_sharing_window_t::on);
+        const uint32_t off = window_angle(magnitude_q24, &machine_sharing_window_t::off);
+        const conduction_interval_t &found = progress.interval;
+        if (state.partial_q15 > 0) {
+            const uint32_t begin = int32_t(on) > 0 ? on : 0;
+            uint32_t from = on, leave = off; // a blend of which more follows: its rounding adds up
+            if (state.level_q15 > 0) {
+                from = begin + uint32_t(int32_t(rounded(begin, -progress.pulse.lead)));
+                leave = off + uint32_t(int32_t(rounded(off, progress.pulse.end)));
+            }
+            expect_blend(found.on, from, progress.partial.on, state.partial_q15, "turn-on above base speed", 3);
+            expect_blend(found.leave, leave, progress.partial.end, state.partial_q15, "turn-off above base speed", 3);
+        } else if (state.level_q15 > 0) {
+            expect_blend(found.on, int32_t(on) > 0 ? on : 0, -progress.pulse.lead, state.level_q15, "turn-on");
+            expect_blend(found.leave, off, progress.pulse.end, state.level_q15, "turn-off");
+        } else {
+            ASSERT_EQ(found.enter, on);
+            ASSERT_EQ(found.leave, off);
+        }
+    }
+
+    wide_integer::wide_t rounded(uint32_t from, uint32_t to) const {
+        return wide_integer::nearest(wide_integer::wide_t(int32_t(to - from)) * state.level_q15, 32768);
+    }
+
+    void expect_partial_pulse() const {
+        const unsigned above = std::min(unsigned(state.part_q15) / 8192, MACHINE_PULSE_PARTS + 0u);
+        const auto at = [&](unsigned part) -> std::array<uint32_t, 2> {
+            if (part == MACHINE_PULSE_PARTS) {
+                return {-progress.pulse.lead, progress.pulse.end};
+            }
+            const machine_partial_pulse_t *of = &tables.partial_pulse[state.braking][part][progress.place.k];
+            return {uint32_t(at_q8(of[0].on, of[1].on)) << 16, uint32_t(at_q8(of[0].end, of[1].end)) << 16};
+        };
+        const auto low = at(above > 0 ? above - 1 : 0), high = at(above);
+        const int32_t fraction_q15 = (state.part_q15 - int32_t(above) * 8192) * 4;
+        expect_blend(progress.partial.on, low[0], high[0], fraction_q15, "turn-on of a part");
+        expect_blend(progress.partial.end, low[1], high[1], fraction_q15, "turn-off of a part");
+    }
+
+    void expect_braking_limit(const conduction_sample_t &s) const {
+        using namespace wide_integer;
+        const int32_t found_q24 = s.speed_q22 < 0 ? state.torque_max_q24 : -state.torque_min_q24;
+        const wide_t kept_q15 = conduction_at_rest(s.speed_q22) ? ONE_Q15 : wide_t(state.room_q15);
+        const wide_t difference_q39 = found_q24 * ONE_Q15 - progress.braking_max_q24 * kept_q15;
+        ASSERT_LE(std::llabs(int64_t(difference_q39)), 2 * 32768);
+    }
+};
+
+TEST_F(ConductionRounding, everything_is_rounded_as_the_header_states_for_random_samples) {
+    std::mt19937 random(18);
+    const auto between = [&](double least, double most) {
+        return std::uniform_real_distribution<double>(least, most)(random);
+    };
+    unsigned sharing = 0, blended = 0, above_base = 0, limited = 0;
+    parameters.own_windows = true;
+    for (unsigned k = 0; k < 20000; k++) {
+        conduction_reset(&parameters, &state, &progress);
+        const double torque = between(-40.0, 40.0), speed = between(-1.1, 1.1) * SPEED_MAX_RAD_S;
+        const sample_t s{torque, torque, 0.0, speed, between(200.0, 300.0), 0.02};
+        const conduction_sample_t sample = fixed(s);
+        const int32_t magnitude_q24 = std::abs(sample.torque_q24);
+        update(s);
+        update(s); // by the law of the speed
+        if (state.trim_q30 != 0 || progress.extension != 0) {
+            ADD_FAILURE() << "more than the torque moves the angles";
+            return;
+        }
+        expect_place(sample);
+        expect_pulse();
+        expect_level_and_part(magnitude_q24);
+        if (state.partial_q15 > 0) {
+            expect_partial_pulse();
+        }
+        expect_positions(magnitude_q24);
+        expect_braking_limit(sample);
+        if (HasFatalFailure()) {
+            FAIL() << "sample " << k << ": " << torque << " N m, " << speed << " rad/s";
+        }
+        ++(state.partial_q15 > 0 ? above_base : state.level_q15 > 0 ? blended : sharing);
+        limited += state.room_q15 < 32768;
+    }
+    EXPECT_GT(sharing, 500u);
+    EXPECT_GT(blended, 500u);
+    EXPECT_GT(above_base, 500u);
+    EXPECT_GT(limited, 500u);
 }
 
 TEST(FullLink, limits_the_braking_torque_linearly_over_the_last_volts_and_to_zero_above) {

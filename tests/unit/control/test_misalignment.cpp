@@ -436,6 +436,143 @@ TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_
     EXPECT_EQ(misalignment_slope_q24(&state), 0) << "without current";
 }
 
+// A low-pass with a gain below 1: its change is the product rounded to 2 LSB.
+void expect_low_pass(int32_t before, int32_t target, int32_t gain_q16, int32_t after, const char *of) {
+    using namespace wide_integer;
+    const wide_t change_q16 = (wide_t(target) - before) * gain_q16;
+    const wide_t found_q16 = (wide_t(after) - before) * power_of_2(16);
+    ASSERT_LE(std::llabs(int64_t(found_q16 - change_q16)), int64_t(1) << 16) << of;
+}
+
+misalignment_t any_state(std::mt19937 &random) {
+    misalignment_t state{};
+    const auto up_to = [&](int32_t most) { return wide_integer::any_up_to(random, 2 * most) - most; };
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        misalignment_phase_t &of = state.phase[phase];
+        of.slope_lag1_q24 = up_to(4 << 24);
+        of.slope_lag2_q24 = up_to(4 << 24);
+        of.slope_mean_q24 = up_to(1 << 24);
+        of.offset_q40 = int64_t(up_to(1 << 30)) * 1024;
+    }
+    state.disturbance_mean_q24 = up_to(1 << 24);
+    state.power_q24 = wide_integer::any_up_to(random, 8 << 24);
+    state.common_power_q40 = int64_t(wide_integer::any_up_to(random, 1 << 30)) << (random() % 12);
+    state.common_slope = {up_to(1 << 24), up_to(1 << 24)};
+    state.common_disturbance = {up_to(1 << 24), up_to(1 << 24)};
+    state.learning = true;
+    return state;
+}
+
+TEST(MisalignmentRounding, a_step_of_a_phase_rounds_products_and_low_passes_as_its_header_states) {
+    using namespace wide_integer;
+    std::mt19937 random(4);
+    misalignment_parameters_t parameters = parameters_of(100);
+    int limited = 0, learned = 0;
+    for (int i = 0; i < 20000; i++) {
+        parameters.mean_q16 = 1 + any_up_to(random, 65534);
+        misalignment_t state = any_state(random);
+        state.steady_updates = parameters.settle_updates;
+        // Sums and means without a rounding of their own.
+        const int32_t mean_q24 = 4 * (any_up_to(random, 1 << 22) - (1 << 21));
+        const misalignment_sample_t sample = {.current_q9 = any_up_to(random, 20 * 512),
+                                              .angle = uint32_t(random()),
+                                              .disturbance_q24 = int32_t(PHASES) * mean_q24,
+                                              .torque_q24 = (1 << 24) + 1 + any_up_to(random, 1 << 26),
+                                              .bandwidth_rad_s = 20 + uint32_t(any_up_to(random, 1500)),
+                                              .condition = MISALIGNMENT_STEADY};
+        const misalignment_t before = state;
+        misalignment_step(&parameters, &state, &machine_tables, &sample);
+        const misalignment_phase_t &was = before.phase[0], &is = state.phase[0];
+        const wide_t filter_q16 =
+            nearest(wide_t(sample.bandwidth_rad_s) * 65536 * parameters.filter_q32, power_of_2(32));
+        const auto lag_q16 = int32_t(filter_q16 < 65535 ? filter_q16 : 65535);
+        expect_low_pass(was.slope_lag1_q24, is.slope_q24, lag_q16, is.slope_lag1_q24, "first filter");
+        expect_low_pass(was.slope_lag2_q24, is.slope_lag1_q24, lag_q16, is.slope_lag2_q24, "second filter");
+        expect_low_pass(was.slope_mean_q24, is.slope_lag2_q24, parameters.mean_q16, is.slope_mean_q24, "mean");
+        const int32_t alternating_q24 = is.slope_lag2_q24 - is.slope_mean_q24;
+        const wide_t square_q24 = nearest(wide_t(alternating_q24) * alternating_q24, power_of_2(24));
+        const int32_t gain_q16 = parameters.mean_q16 / int32_t(PHASES) + 1;
+        expect_low_pass(before.power_q24, saturated(PHASES * square_q24), gain_q16, state.power_q24, "power");
+        expect_low_pass(before.disturbance_mean_q24, sample.disturbance_q24, gain_q16, state.disturbance_mean_q24, "y");
+
+        const int32_t error_q24 = mean_q24 - state.disturbance_mean_q24;
+        const wide_t torque_square_q24 =
+            saturated(nearest(wide_t(sample.torque_q24) * sample.torque_q24, power_of_2(24)));
+        const wide_t floor_q24 = nearest(torque_square_q24 * (21 << 12), power_of_2(32)); // 0.05 of (0.02 rad)^2
+        const wide_t divisor_q20 = rounded_down(saturated(state.power_q24 + floor_q24), 16) + 1;
+        const wide_t product_q30 = nearest(wide_t(error_q24) * alternating_q24, power_of_2(18));
+        if (!fits(2 * product_q30)) {
+            continue; // saturates, to within some LSB of the end
+        }
+        const wide_t step_q10 = std::clamp<wide_t>(product_q30 / divisor_q20, -4096, 4096); // 0.08 rad
+        ASSERT_EQ(is.offset_q40 - was.offset_q40, int64_t(step_q10 * parameters.rate_q30)) << i;
+        const wide_t offset_q28 = nearest(is.offset_q40, power_of_2(12));
+        ASSERT_EQ(is.offset, int32_t(nearest(offset_q28 * parameters.probe_angle, power_of_2(27)))) << i;
+        limited += step_q10 == 4096 || step_q10 == -4096;
+        learned += step_q10 != 0;
+    }
+    EXPECT_GT(learned, 2000);
+    EXPECT_GT(limited, 20);
+    EXPECT_LT(limited, learned);
+}
+
+TEST(MisalignmentRounding, a_step_of_the_common_angle_rounds_products_and_low_passes_as_its_header_states) {
+    using namespace wide_integer;
+    std::mt19937 random(5);
+    misalignment_parameters_t parameters = parameters_of(100);
+    parameters.noise_q22 = 0;
+    int learned = 0;
+    for (int i = 0; i < 20000; i++) {
+        misalignment_t state = any_state(random);
+        const misalignment_t before = state;
+        state.disturbance_sum_q24 = 4 * int64_t(any_up_to(random, 1 << 25) - (1 << 24));
+        const int32_t torque_q24 = any_up_to(random, 1 << 30), part_q16 = any_up_to(random, 1 << 14);
+        misalignment_common_step(&parameters, &state, PHASES, torque_q24, part_q16);
+        const int32_t gain_q16 = 4 * std::min(part_q16, 1 << 13); // of a stroke
+        int32_t sum_q24 = 0;
+        for (unsigned phase = 0; phase < PHASES; phase++) {
+            sum_q24 += before.phase[phase].slope_lag2_q24 / 4;
+        }
+        const auto expect_band = [&](const misalignment_band_t &was, const misalignment_band_t &is, int32_t value_q24) {
+            expect_low_pass(was.mean_q24, value_q24, gain_q16, is.mean_q24, "mean of the band");
+            expect_low_pass(was.value_q24, value_q24 - is.mean_q24, gain_q16, is.value_q24, "band");
+        };
+        expect_band(before.common_slope, state.common_slope, sum_q24);
+        expect_band(before.common_disturbance, state.common_disturbance, int32_t(state.disturbance_sum_q24 / 4));
+        const wide_t quarter_q24 = state.common_slope.value_q24;
+        const wide_t square_q40 = rounded_down(quarter_q24 * quarter_q24, power_of_2(8));
+        ASSERT_EQ(state.common_power_q40 - before.common_power_q40,
+                  int64_t(rounded_down(square_q40 - before.common_power_q40, power_of_2(8))));
+        const wide_t torque_q9 = torque_q24 >> 15;
+        const wide_t floor_q22 = rounded_down(torque_q9 * torque_q9, power_of_2(25)) + 1;
+        const wide_t power_q22 = saturated(rounded_down(state.common_power_q40, power_of_2(18)));
+        const wide_t product_q30 = nearest(quarter_q24 * state.common_disturbance.value_q24, power_of_2(18));
+        if (!fits(2 * product_q30)) {
+            continue; // saturates, to within some LSB of the end
+        }
+        const wide_t step_q10 = std::clamp<wide_t>(product_q30 / saturated(power_q22 + floor_q22), -4096, 4096);
+        ASSERT_EQ(state.common_sum_q40, int64_t(step_q10 * parameters.common_rate_q30)) << i;
+        learned += step_q10 != 0;
+    }
+    EXPECT_GT(learned, 2000);
+}
+
+TEST(MisalignmentRounding, a_step_by_the_flux_linkage_is_rounded_down_to_2_to_the_minus_40) {
+    using namespace wide_integer;
+    std::mt19937 random(6);
+    const misalignment_parameters_t parameters = parameters_of(8);
+    for (int i = 0; i < 20000; i++) {
+        misalignment_t state = any_state(random);
+        state.phase[0].offset = any_up_to(random, 1 << 24);
+        const misalignment_phase_t was = state.phase[0];
+        const int32_t told = any_up_to(random, 1 << 25) - (1 << 24);
+        misalignment_follow_flux(&parameters, &state, &machine_tables, uint32_t(random()), 0, told);
+        const wide_t error = told != 0 ? wide_t(told) - was.offset : 0;
+        ASSERT_EQ(state.phase[0].offset_q40 - was.offset_q40,
+                  int64_t(rounded_down(error * parameters.flux_rate_q8, power_of_2(8))));
+    }
+}
+
 TEST(MisalignmentDisturbance, is_load_torque_less_the_rounded_product_for_any_arguments) {
     using namespace wide_integer;
     std::mt19937 random(3);
