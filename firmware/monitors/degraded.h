@@ -3,8 +3,8 @@
  * Of the faults of a phase that can be done without: phase_open, which is an open winding, an open switch, no gate
  * supply or a dead current sensor, and current_sensor, of one phase each. Its switches stay open from then on, until,
  * outside a run, `clear_fault` or a parameter that no longer allows it gives it back. With both of them open the
- * current falls to zero within a stroke; a sensor that then still reads one, or a current that flows, is a fault as
- * ever (monitors/phase_evidence.h), and so is any other failed check. A shorted switch is never run on with: its phase
+ * current falls to zero within a stroke; a sensor that then still reads one, or a current that flows, is still a
+ * fault (monitors/phase_evidence.h), and so is any other failed check. A shorted switch is never run on with: its phase
  * cannot be switched off.
  *
  * The torque that remains is the sum of the torques of the other phases at the current limit, each in the window in

@@ -1,4 +1,4 @@
-/* Measured temperatures of the windings and of the switches of each phase: a limit of its own beside the thermal models
+/* Measured temperatures of the windings and of the switches of each phase: a separate limit beside the thermal models
  * of the currents (thermal.h). Those know the heat of a current before a sensor shows it; the sensors know the
  * surroundings, the cooling and the heat from before a reset. The smallest limit of the torque counts, and the faults
  * are the same.

@@ -58,7 +58,7 @@ def test_encoder_frozen_before_the_start_is_a_fault_before_the_rotor_has_turned_
     assert bench.drive.fault == "encoder"
     assert 0.2 < motion_deg(bench, 0.0, fault_s(bench)) < 5.5
     assert peak_A(bench) < TRIP_A
-    # From the begin of the run; half a degree at the torque limit takes this long.
+    # From the start of the run; half a degree at the torque limit takes this long.
     inertia_kg_m2 = machine_of(machine).inertia_kg_m2
     started_s = next(t for t, state in zip(bench.telemetry["state"].time_s, bench.telemetry["state"].value, strict=True)
                      if state >= 2) - 0.001

@@ -152,7 +152,7 @@ def test_faults_are_listed(can):
 
 
 @pytest.mark.parametrize(("arguments", "expected"), [
-    (["store", "x.toml"], "no action store: must be one of save, compare, load, faults"),
+    (["store", "x.toml"], "unknown action 'store': must be one of save, compare, load, faults"),
     (["load"], "the following arguments are required: FILE.toml"),
     (["save", "x.toml", "--can", "bus"], "--can bus: must be unix:PATH or socketcan:INTERFACE"),
     (["faults", "--can", "unix:/no/such/bus"], "unix:/no/such/bus: no drive answers there"),

@@ -134,7 +134,7 @@ def test_commands_work_without_clone(installed, tmp_path):
 
 
 def test_what_only_a_clone_has_is_refused_in_one_line(installed, tmp_path):
-    for arguments, error in (*(((name,), f"salient: no command {name}: the nearest of ")
+    for arguments, error in (*(((name,), f"salient: unknown command '{name}': the nearest of ")
                                for name in CLONE_ONLY),
                              (("sim", "--target", "rv32"), "salient: --target rv32: only in a clone")):
         done = installed.run("salient", *arguments, cwd=tmp_path)

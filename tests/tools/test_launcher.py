@@ -39,9 +39,9 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
-        (["monitr"], ["no command monitr: the nearest of 19 are monitor, ", "tools/salient --help"]),
-        (["fo'o"], ["no command fo'o: the nearest of "]),
-        (["a\nb"], ["no command a b: the nearest of "]),
+        (["monitr"], ["unknown command 'monitr': the nearest of 19 are monitor, ", "tools/salient --help"]),
+        (["fo'o"], ["unknown command 'fo'o': the nearest of "]),
+        (["a\nb"], ["unknown command 'a b': the nearest of "]),
         (["--can", "unix:x", "sim"], ["unrecognised argument --can; must be one of --help, "]),
         (["sim", "--pcae", "free"], ["unrecognised argument --pcae; the nearest of ", " are --pace, ",
                                      "tools/salient sim --help"]),

@@ -103,7 +103,7 @@ def test_rewound_and_replayed_the_run_has_the_same_bits_and_another_branch_is_be
     first = hash_at(page, 1.2)
     page.get_by_role("button", name="−1 s").click()
     assert page.evaluate("salient.source.run.timeNs") == pytest.approx(0.2e9, abs=1e6)
-    page.get_by_role("button", name="Stop time").click()  # it goes on
+    page.get_by_role("button", name="Freeze").click()  # it goes on
     wait_until(page, 1.2)
     page.wait_for_function("document.getElementById('notice').textContent.includes('The same bits at 1.200 s')")
     assert hash_at(page, 1.5) != first

@@ -627,5 +627,5 @@ def test_time_of_a_link_without_virtual_time_is_that_of_the_drive_also_after_a_r
     assert link.drive.command_due_ns is None  # and that sleeps from here on
     starts = [can.Message(timestamp=1.6e9 + 2, arbitration_id=0x180, is_extended_id=False, data=bytes(8))]
     bus.frames += starts
-    with pytest.raises(DriveError, match="the drive has started anew"):
+    with pytest.raises(DriveError, match="the drive has restarted"):
         link.advance_to(10**12)

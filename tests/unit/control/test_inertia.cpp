@@ -149,7 +149,7 @@ TEST(Inertia, the_end_of_a_start_identifies_an_inertia_under_a_load_that_began_w
 }
 
 TEST(Inertia, what_pulls_for_a_millisecond_at_the_end_of_a_short_start_is_no_other_inertia) {
-    // The regression begins anew after 4 windows of 0.8 ms.
+    // The regression begins again after 4 windows of 0.8 ms.
     for (const double end_s : {0.0026, 0.003, 0.0034}) {
         const torque_t run = [=](double t) { return t < end_s ? TORQUE_MAX : 0.0; };
         const torque_t load = [=](double t) { return t > end_s && t < end_s + 0.0012 ? -12.0 : 0.0; };

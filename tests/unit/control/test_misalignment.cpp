@@ -425,7 +425,7 @@ TEST(Misalignment, by_the_flux_linkage_alone_each_phase_approaches_its_angle_at_
     }
     EXPECT_NEAR(state.phase[1].offset / double(told), 1.0 - std::exp(-8.0 / 2.0 / 4.0), 0.02);
     EXPECT_EQ(state.phase[0].offset, 0) << "0: unknown";
-    EXPECT_EQ(state.steady_updates, 0u) << "the ripple begins anew";
+    EXPECT_EQ(state.steady_updates, 0u) << "learning from the ripple begins again";
     const int32_t slope_q24 =
         phase_map_torque_slope_q24(&machine_tables, angle_from_rev(0.75), 15 * 512, 2 * parameters.probe_angle);
     EXPECT_EQ(misalignment_slope_q24(&state), int32_t(PHASES) * slope_q24);

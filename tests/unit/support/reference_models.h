@@ -211,7 +211,7 @@ inline double flux_step(double flux, double gain, double table, double applied, 
 // torque.
 struct own_windows_t {
     struct window_t {
-        double on, off; // past the begin of the half, electrical rev
+        double on, off; // past the start of the half, electrical rev
     };
     std::array<std::array<std::array<window_t, 4>, 2>, 2> window{};
     double torque = 0.0, base_step_per_V = 0.0; // electrical rev per period and volt at the base speed

@@ -45,7 +45,7 @@ class _Parser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:  # COMMAND or ACTION: no option has choices
-            self.error(f"no {str(action.metavar).lower()} {value}: {close_names(value, action.choices)}")
+            self.error(f"unknown {str(action.metavar).lower()} '{value}': {close_names(value, action.choices)}")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         """Names a misspelt option ahead of what is missing because of it, and leaves no argument to the parser above,
@@ -301,7 +301,7 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the groups")
     parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
                         "speed and its loads of its rated torque, as those of the paper's machine")
-    parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: some 20 s")
+    parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: about 20 s")
     parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
                         help="folder (default out/compare)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
@@ -312,8 +312,8 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true",
                         help="keep the finished runs in the folder, of the same scenario, machine and executable")
     parser.add_argument("--baseline", type=Path, metavar="DIR|FILE",
-                        help="folder or compare.json of an earlier run: list the changes, exit code 1 when one is for "
-                        "the worse")
+                        help="folder or compare.json of an earlier run: list the changes, exit code 1 if anything "
+                        "got worse")
     parser.add_argument("--worse-percent", type=_percent, default=CHANGE_PERCENT, metavar="X",
                         help=f"a larger change is reported (default {CHANGE_PERCENT:g})")
 

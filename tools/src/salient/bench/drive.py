@@ -167,7 +167,7 @@ class Drive(KnownAttributes):
         self.command_due_ns = None
         self._end_arming()
 
-    def time_begins_anew(self) -> None:
+    def time_restarts(self) -> None:
         """The session's time is an earlier one from here on: what is to be repeated is due now, an arming has ended."""
         if self.command_due_ns is not None:
             self.command_due_ns = self._session.time_ns

@@ -57,7 +57,7 @@ def measure(duration_s: float) -> dict[str, Any]:
     print(f"  from the server's reception of a frame to its display: median {figures['median_ms']:.0f} ms, "
           f"p99 {figures['p99_ms']:.0f} ms")
     print(f"  server {figures['server_percent']:.1f} % of a core, {figures['frames_per_s']:.0f} frames/s, "
-          f"{figures['pictures_per_s']:.0f} pictures/s, {figures['lost']} frames lost")
+          f"{figures['pictures_per_s']:.0f} fps, {figures['lost']} frames lost")
     return figures
 
 

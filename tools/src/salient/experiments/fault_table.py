@@ -52,7 +52,7 @@ class FaultCase:
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a drive did. fault: its first cause, "none" when it runs on. detected_s: from the begin of the fault, or of
+    """What a drive did. fault: its first cause, "none" when it runs on. detected_s: from the start of the fault, or of
     the run when that is later, to the first cause, None without one. peak: largest true phase current after that begin,
     of the trip. travel_deg: largest rotation of the shaft from it to the first cause."""
 
@@ -199,7 +199,7 @@ _INTRODUCTION = f"""\
 What can be asked for is in [emulator/FAULTS.md](../emulator/FAULTS.md), what each fault of the drive means in
 [README.md](README.md) and `comms/drive.dbc`. Each cell is one run at 40 kHz with the default parameters, a 12-bit
 converter and an encoder of 17 bits: the fault begins at {SPEED_RPM:g} r/min under {LOAD_NM:g} N m, or before a start to
-that speed, in phase b where it has a phase. A cell has the drive's first cause, the time to it from the begin of the
+that speed, in phase b where it has a phase. A cell has the drive's first cause, the time to it from the start of the
 fault or of the run, for an encoder before the start the rotation until then, and the largest true phase current after
 the begin, of the trip. After the first cause all switches are open; a current above 1.1 of the trip is then driven by
 the rotor through the diodes, which no switch can end. A reset by the watchdog is reported once the background runs.
@@ -225,7 +225,7 @@ def page(cells_of: dict[tuple[str, str, str], str]) -> str:
 
 
 def with_branches(text: str) -> str:
-    """A page with the section of the committed results of branching, its last one, anew."""
+    """A page with the section of the committed results of branching, its last one, rewritten."""
     head = text.partition(f"## {branching.HEADING}\n")[0].rstrip()
     return f"{head}\n\n{branching.section(branching.read(BRANCHES))}"
 

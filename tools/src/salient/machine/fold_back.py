@@ -29,7 +29,7 @@ _ROOM_ABOVE_CHOPPER = 1.75
 def fold_back_V(machine: Machine, data: DriveData) -> float:
     """Range below over_voltage_V in which the voltage of each control period reduces the braking torque. There is
     none from its middle on, or from a quarter of the way from the chopper's voltage to over_voltage_V on if that is
-    higher. 0 for a supply that takes energy back."""
+    higher. 0 for a regenerative supply."""
     link = machine.dc_link
     if link is None:
         return 0.0

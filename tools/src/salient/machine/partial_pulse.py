@@ -50,7 +50,7 @@ _REFUSED = 1e3
 _NARROW_WEIGHT = 0.1
 """Square of the current that a pulse may take more which is as wide as a stroke rather than of no width."""
 _FIRST_DEG = -162
-"""Past the begin of the half of the wanted torque, before which no phase is turned on."""
+"""Past the start of the half of the wanted torque, before which no phase is turned on."""
 _SHARE_LEAD_DEG = 20.0
 """As SHARE_LEAD_MAX."""
 _JUMP_COST = 0.06
@@ -73,7 +73,7 @@ class PartialPulse:
     """By half, motoring and braking, part of the largest mean torque, and speed."""
 
     on_deg: np.ndarray
-    """Turn-on past the begin of the half; negative: before it."""
+    """Turn-on past the start of the half; negative: before it."""
     off_deg: np.ndarray
     """Turn-off past it."""
     ripple: np.ndarray
@@ -85,7 +85,7 @@ class _Choices:
     """By way and lane."""
 
     angles_deg: np.ndarray
-    """Turn-on and turn-off past the begin of the half, (2, ...)."""
+    """Turn-on and turn-off past the start of the half, (2, ...)."""
     reference_Nm: np.ndarray
     cost: np.ndarray
 
@@ -248,7 +248,7 @@ class _Follower:
                         np.vstack([reference_Nm, _RIPPLE_MARGIN * crest * wanted_Nm]), np.vstack([cost, pulse.ripple]))
 
     def run(self, angles_deg: np.ndarray, reference_Nm: np.ndarray, flux_Wb: np.ndarray | None = None) -> _Operation:
-        """Turn-on and turn-off past the begin of the half, (2, ...), from flux linkages of the phases."""
+        """Turn-on and turn-off past the start of the half, (2, ...), from flux linkages of the phases."""
         phase, phases, stroke_deg = self.phase, self.phases, self.stroke_deg
         on_deg, off_deg = angles_deg
         enter_deg = np.maximum(on_deg, -_SHARE_LEAD_DEG)

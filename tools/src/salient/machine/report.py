@@ -83,7 +83,7 @@ def describe(machine: Machine) -> list[str]:
         f"  shaft       {machine.inertia_kg_m2:g} kg m^2, {machine.friction_Nm_s:g} N m s",
         f"  supply      {machine.supply_voltage_V:g} V"
         + (f" through {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"
-           " uF" if machine.dc_link else ", takes energy back"),
+           " uF" if machine.dc_link else ", regenerative"),
         "  torque      maximum of one phase: "
         + ", ".join(f"{torque:.3g} N m at {i:g} A" for torque, i in zip(torques_Nm.max(axis=0), shown_A, strict=True)),
     ]

@@ -1,7 +1,7 @@
 """The windows of the torque sharing function (firmware/control/torque_sharing.h) with the least RMS current, by half,
 speed and torque.
 
-Angles are electrical degrees past the begin of the half of the wanted torque: motoring from the unaligned, braking from
+Angles are electrical degrees past the start of the half of the wanted torque: motoring from the unaligned, braking from
 the aligned position. At standstill they are those of least_current.py. With speed the voltage limits the rate of the
 flux linkage: phases follow their shares as far as it permits, the others make up for them as in
 firmware/control/predictive_torque.h, and the best window is one that begins and ends earlier. By how much is found by

@@ -69,7 +69,7 @@ class SinglePulse:
     lead_deg: np.ndarray
     """(2, POINTS), turn-on before the half of the wanted torque."""
     end_deg: np.ndarray
-    """(2, POINTS), turn-off past the begin of that half."""
+    """(2, POINTS), turn-off past the start of that half."""
     smooth_Nm: np.ndarray
     """(2, POINTS), largest torque without lead and without ripple."""
     mean_Nm: np.ndarray

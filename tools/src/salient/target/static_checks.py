@@ -64,7 +64,7 @@ def indirect_calls(image: ElfImage) -> list[str]:
 
 
 _RESTARTS = {("board_restart", "program_start")}
-"""Jumps with the stack pointer at its initial value: the stack begins anew."""
+"""Jumps with the stack pointer at its initial value: the stack is empty again."""
 
 
 def deepest_stack(image: ElfImage, function: str) -> tuple[int, list[str]]:

@@ -33,7 +33,7 @@ class LinkClosed(Exception):
 
 class DriveTime:
     """Puts frames of a bus without virtual time on the drive's own time, by the stamps in DRIVE_STATUS. starts: the
-    times that the drive has started anew, from where its time is an earlier one."""
+    times that the drive has restarted, from where its time is an earlier one."""
 
     def __init__(self, database: Database) -> None:
         self._identifier = database.get_message_by_name("DRIVE_STATUS").frame_id
@@ -122,7 +122,7 @@ class Link:
         raise RigError("no test bench answers on this bus")
 
     def advance_to(self, time_ns: int) -> None:
-        """Receives until that time; DriveError when the drive starts anew before."""
+        """Receives until that time; DriveError when the drive restarts before."""
         starts = self._drive_time.starts
         while self.time_ns < time_ns:
             self._receive(_TICK_S)
@@ -130,7 +130,7 @@ class Link:
 
     def advance_until_frame(self, matches: Callable[[can.Message], bool], timeout_s: float) -> can.Message:
         """Receives until a frame meets the condition; TimeoutError after timeout_s of the drive's time, DriveError when
-        the drive starts anew before."""
+        the drive restarts before."""
         deadline_ns, starts = self.time_ns + round(timeout_s * 1e9), self._drive_time.starts
         while self.time_ns < deadline_ns:
             message = self._receive(_TICK_S)
@@ -141,7 +141,7 @@ class Link:
 
     def _check_same_start(self, starts: int) -> None:
         if self._drive_time.starts != starts:
-            raise DriveError(f"{self.address}: the drive has started anew")
+            raise DriveError(f"{self.address}: the drive has restarted")
 
     # --- the thread of the bus -------------------------------------------------------------------------------------
 
@@ -196,7 +196,7 @@ class Link:
                 return message
             time_ns = known_ns
             if self._drive_time.starts != starts:
-                self._begin_anew(time_ns)
+                self._restart(time_ns)
         self.time_ns = max(self.time_ns, time_ns)
         self.telemetry.add(time_ns, message)
         self._chunk.add(time_ns, message)
@@ -204,15 +204,15 @@ class Link:
             self._send_due()
         return message
 
-    def _begin_anew(self, time_ns: int) -> None:
-        """The drive has started anew: its time is an earlier one, and what was shown is not later than that."""
+    def _restart(self, time_ns: int) -> None:
+        """The drive has restarted: its time is an earlier one, and what was shown is not later than that."""
         self.time_ns = time_ns
-        self.drive.time_begins_anew()
+        self.drive.time_restarts()
         if self.shown_ns is not None:
             self.shown_ns = min(self.shown_ns, time_ns)
 
     def take_shown(self, shown_ns: int) -> None:
-        """What the commanding page has shown; it may be of the time before the drive has started anew."""
+        """What the commanding page has shown; it may be of the time before the drive restarted."""
         self.shown_ns = min(shown_ns, self.time_ns)
 
     def _send_due(self) -> None:

@@ -3,8 +3,8 @@
     python -m salient.experiments.campaign.branching DIR [EVERY]
 
 forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
-150 r/min with load and at 1500 r/min, and at the begin of a start from 360 positions of the rotor, and lets each fault
-begin there (emulator/campaign/branch.h). Writes DIR/branches-POINT.jsonl and DIR/summary.json and prints a table. An
+150 r/min with load and at 1500 r/min, and at the beginning of a start from 360 positions of the rotor, and lets each
+fault begin there (emulator/campaign/branch.h). Writes DIR/branches-POINT.jsonl and DIR/summary.json and prints a table. An
 operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
 """
 
@@ -32,7 +32,7 @@ ANCHOR = "longest-time-wherever-a-fault-begins"
 _INTRODUCTION = """\
 By branching ([tools/README.md](../tools/README.md#campaigns-by-seed)), salient on the machine saturating at 40 kHz
 with sensors of 12 and 17 bits: the fault begins in phase a at every control tick of an electrical period at two
-speeds, and at the begin of a start from each of 360 positions; one that has once been answered after more than 100
+speeds, and at the beginning of a start from each of 360 positions; one that has once been answered after more than 100
 ms, or not, at every 50th tick and every tenth position. A time is the longest from its begin until the first cause,
 with the number of branches that were answered where not all were within 1 s; a violation, one of the rules of
 [the checkers](../emulator/campaign/CHECKERS.md).
@@ -121,7 +121,7 @@ def draw(axes: Any, rows: Rows) -> None:
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_xscale("log")
     axes.set_xlim(left=0.0001)  # room for the legend
-    axes.set_xlabel("longest time from the begin of a fault until the drive has reacted, ms")
+    axes.set_xlabel("longest time from the start of a fault until the drive has reacted, ms")
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize="x-small")
 

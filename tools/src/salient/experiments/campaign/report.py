@@ -2,7 +2,7 @@
 
     python -m salient.experiments.campaign.report
 
-writes them anew from the results in tests/campaign, which the commands of the table have left.
+rewrites them from the results in tests/campaign, which the commands of the table have left.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _rate(name: str) -> list[str]:
         return []
     rate = _note(name)
     return [f"{rate['worlds'] / rate['processor_s']:.0f} worlds or {rate['virtual_s'] / rate['processor_s']:.0f} s of "
-            "virtual time a processor second"]
+            "virtual time per CPU-second"]
 
 
 def _worlds(name: str, what: str, sharding: str = "") -> tuple[str, str, str]:
@@ -80,9 +80,9 @@ def _branches() -> tuple[str, str, str]:
     found = [row for lines in rows.values() for row in lines if row["violations"]]
     listed = "; ".join(sorted({f"`{branching.label(row)}`" for row in found}))
     return ("every fault at every control tick of an electrical period at 150 r/min with 8 N m and at 1500 r/min with "
-            "6 N m, and at the begin of a start from 360 positions",
+            "6 N m, and at the beginning of a start from 360 positions",
             f"{of_all['branches']:,} branches at {_commits(notes.values())}; {of_all['virtual_s'] / 3600:.2f} h of "
-            f"virtual time; {of_all['branches'] / processor_s:.0f} branches a processor second; longest reaction "
+            f"virtual time; {of_all['branches'] / processor_s:.0f} branches per CPU-second; longest reaction "
             f"{longest['longest_us'] / 1000:.0f} ms (`{branching.label(longest)}`), each in "
             f"[FAULTS.md](../firmware/FAULTS.md#{branching.ANCHOR}); not always answered: "
             f"{', '.join(f'`{label}`' for label in unanswered)}; **{of_all['violations']:,} violations**"
@@ -96,7 +96,7 @@ def _planted() -> tuple[str, str, str]:
     return ("planted bugs",
             f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} processor "
             f"seconds each, {middle_s:.1f} in the middle, by seeds from 1 to at most {of['last_seed']}; shrunk to at "
-            f"most {of['events']} events in at most {of['shrinking_s']:.1f} processor seconds; {of['replayed']} "
+            f"most {of['events']} events in at most {of['shrinking_s']:.1f} CPU-seconds; {of['replayed']} "
             "replayed with equal bits, log and plots; the counts are in [planted.json](../tests/planted.json)",
             "`build/venv/bin/python -m salient.experiments.planted`")
 

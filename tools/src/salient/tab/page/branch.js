@@ -1,4 +1,4 @@
-// The branch of a run that was left, beside the present one: its signals, dashed, in the plots of the page.
+// The abandoned branch of a run, beside the present one: its signals, dashed, in the plots of the page.
 
 const WIDTH = 1;
 

@@ -92,7 +92,7 @@ async function main() {
     source.onRewound = (fromNs) => other.keep(fromNs);
     source.onEnd = () => page.stopped || page.stopTime();
     document.querySelector("#run-panel > .hint:last-child").textContent = "The drive is in this page: its time stands still "
-        + "while the page is not seen. To go back and change something takes another branch; the one that was left is dotted.";
+        + "while the page is not seen. After going back, a change begins another branch; the abandoned one is dotted.";
     makeBar(page, source);
     if (setting.build !== undefined && setting.build !== data.build) {
         tell(`The link is of build ${setting.build}, this page is of build ${data.build}: its bits may be others.`, true);

@@ -46,7 +46,7 @@ export class Run {
         this.world = new World((records) => this.client.receive(records));
         this.client.join(this.world);
         this.done = []; // events: { timeNs, name, args }
-        this.ahead = []; // those to come, of a link or of a branch that was left; and { timeNs, hash }
+        this.ahead = []; // those to come, of a link or of an abandoned branch; and { timeNs, hash }
         this.snapshots = [];
     }
 

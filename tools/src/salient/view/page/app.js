@@ -347,7 +347,7 @@ class Page {
             return part;
         });
         const torque = total * this.info.machine.rotor_poles / (2 * Math.PI);
-        element("work").replaceChildren("Work of a stroke, J: ", ...parts,
+        element("work").replaceChildren("Energy per stroke, J: ", ...parts,
                                         Number.isFinite(torque) ? ` mean torque ${torque.toFixed(2)} N m, ${samples} samples` : "");
     }
 
@@ -383,7 +383,7 @@ class Page {
         const bus = this.isReplay ? `${this.store.frames} frames` : `${Math.round(frames)} frames/s`;
         const end_s = (this.timeline.end_ns / 1e9).toFixed(2);
         element("health").textContent =
-            `${end_s} s · ${bus} · ${this.store.lost} lost · ${Math.round(drawn)} pictures/s`;
+            `${end_s} s · ${bus} · ${this.store.lost} lost · ${Math.round(drawn)} fps`;
         const picture = this.state.isTrue ? "True angle and currents of the test bench"
             : "Angle and currents as the drive measures them";
         element("picture-source").textContent = `${picture}. Flux linkage is not on the bus: it is that of the machine `
