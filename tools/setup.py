@@ -8,6 +8,7 @@ An editable installation uses the repository.
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import subprocess
@@ -79,4 +80,14 @@ class PlatformDistribution(Distribution):
         return True
 
 
-setup(version=VERSION, distclass=PlatformDistribution, cmdclass={"build_py": BuildPackage, "bdist_wheel": Wheel})
+def links() -> dict[str, str]:
+    """The project's pages, of the repository whose workflow builds the wheel; none elsewhere."""
+    repository = os.environ.get("GITHUB_REPOSITORY")
+    if not repository:
+        return {}
+    source = f"{os.environ['GITHUB_SERVER_URL']}/{repository}"
+    return {"Source": source, "Changelog": f"{source}/blob/v{VERSION}/CHANGELOG.md", "Issues": f"{source}/issues"}
+
+
+setup(version=VERSION, project_urls=links(), distclass=PlatformDistribution,
+      cmdclass={"build_py": BuildPackage, "bdist_wheel": Wheel})

@@ -170,7 +170,7 @@ def _machine(options: argparse.Namespace) -> int:
 def _wheel(options: argparse.Namespace) -> int:
     from salient.wheel import build
 
-    return build(options.out)
+    return build(options.out, options.tag)
 
 
 def _pil(options: argparse.Namespace) -> int:

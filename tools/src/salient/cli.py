@@ -224,6 +224,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     wheel = command("wheel", "the Python package with its programs, for suites in other repositories")
     wheel.add_argument("--out", type=Path, default=Path("out/wheel"), metavar="DIR",
                        help="folder (default out/wheel)")
+    wheel.add_argument("--tag", metavar="vX.Y.Z", help="tag of a release: must be that of the version")
 
     scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
                     "plot")

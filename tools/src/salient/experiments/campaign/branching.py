@@ -4,8 +4,8 @@
 
 forks the campaign's program before each control interrupt (each EVERY-th, default 1) of an electrical period at
 150 r/min with load and at 1500 r/min, and at the beginning of a start from 360 positions of the rotor, and lets each
-fault begin there (emulator/campaign/branch.h). Writes DIR/branches-POINT.jsonl and DIR/summary.json and prints a table. An
-operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
+fault begin there (emulator/campaign/branch.h). Writes DIR/branches-POINT.jsonl and DIR/summary.json and prints a table.
+An operating point whose results DIR has is not run again. Exit code 1 when a property is violated.
 """
 
 from __future__ import annotations
