@@ -149,6 +149,10 @@ TEST_F(SlowCounts, bound_the_speed_by_four_counts_in_the_time_since_the_last_one
         wait(more);
         const double speed = 4 * COUNT_RAD * RATE_HZ / counts.periods;
         EXPECT_NEAR(results.speed_max_q22 / Q22, speed, 1e-3 * speed) << counts.periods;
+        // The product is rounded to 2 LSB.
+        const int64_t ratio_q16 = (int64_t(parameters.deadbeat_periods) << 16) / counts.periods;
+        const int64_t product_q38 = parameters.late_speed_q22 * ratio_q16;
+        EXPECT_LE(std::llabs((int64_t(results.speed_max_q22) << 16) - product_q38), 1 << 16) << counts.periods;
     }
     step(COUNT, 1);
     EXPECT_EQ(results.speed_max_q22, INT32_MAX) << "a count";
