@@ -20,7 +20,7 @@ def turn_of_name(name: str) -> int:
     return zlib.crc32(name.encode()) % TURNS
 
 
-def turn_of_commit() -> int:
-    """Turn of the commit that is checked out; 0 outside a clone."""
+def turn_of_commit(turns: int = TURNS) -> int:
+    """Turn of the commit that is checked out, of that many; 0 outside a clone."""
     done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
-    return int(done.stdout, 16) % TURNS if done.returncode == 0 else 0
+    return int(done.stdout, 16) % turns if done.returncode == 0 else 0
