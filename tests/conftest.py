@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -14,7 +13,8 @@ import pytest
 from salient.__main__ import main
 from salient.builder import build_preset
 from salient.config import TARGET_BUILDS, WASM_BUILD
-from salient.paths import BUILD, ROOT
+from salient.errors import UsageError
+from salient.paths import BUILD, ROOT, build_lock, from_root
 from salient.turns import TURNS, turn_of_name
 
 BUILDS = {
@@ -32,9 +32,12 @@ sys.path.append(str(ROOT / "tests" / "plant"))
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--turn", type=int, choices=range(TURNS), metavar=f"0..{TURNS - 1}",
                      help="of the tests that are marked in_turns, those of this turn only; default: all of them")
+    parser.addini("cache_dir", "cache of pytest", default=str(BUILD / "pytest_cache"))  # as all that is made here
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.option.salient_failures is None:
+        config.option.salient_failures = BUILD / "failures"
     config.addinivalue_line("markers", "in_turns: takes long, and is run with one commit of several (salient.turns)")
 
 
@@ -62,12 +65,18 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if hasattr(config, "workerinput") or config.option.collectonly or config.getoption("--salient-can") != "local":
         return
     selected = [Path(argument.partition("::")[0]).absolute() for argument in config.args]
-    with (BUILD / "launcher.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # no two commands build at once
+    try:
+        _build(selected)
+    except UsageError as error:
+        pytest.exit(str(error), 2)
+
+
+def _build(selected: Sequence[Path]) -> None:
+    with build_lock():
         for preset, targets in builds_of(selected).items():
             log = BUILD / "build.log"
-            notice = partial(print, f"building {BUILD.name}/{preset}", flush=True)
-            if not build_preset(ROOT, preset, targets, log, notice):
+            notice = partial(print, f"building {from_root(BUILD / preset)}", flush=True)
+            if not build_preset(ROOT, BUILD / preset, targets, log, notice):
                 print(log.read_text(encoding="utf-8", errors="replace")[-4000:])
                 pytest.exit(f"building {preset} failed; `tools/salient test` installs the compilers that it needs", 1)
 

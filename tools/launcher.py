@@ -1,12 +1,11 @@
 """Preparation of a tools/salient command: installs missing packages, builds, and runs the Python package.
 
-Standard library only. All results stay in build/; messages go to standard error.
+Standard library only. All results stay in the build folder (salient.paths.BUILD); messages go to standard error.
 """
 
 from __future__ import annotations
 
 import argparse
-import fcntl
 import hashlib
 import os
 import re
@@ -19,17 +18,17 @@ from pathlib import Path
 from typing import BinaryIO, NoReturn
 
 TOOLS = Path(__file__).resolve().parent
-ROOT = TOOLS.parent
-BUILD = ROOT / "build"
-VENV = BUILD / "venv"
-LOCK = TOOLS / "requirements.lock"
-STAMP = VENV / "salient.stamp"
 
 sys.path.insert(0, str(TOOLS / "src"))
 
 from salient.builder import build_preset  # noqa: E402  (needs the path above)
 from salient.cli import make_parser  # noqa: E402
 from salient.errors import exit_code  # noqa: E402
+from salient.paths import BUILD, ROOT, build_lock, from_root  # noqa: E402
+
+VENV = BUILD / "venv"
+LOCK = TOOLS / "requirements.lock"
+STAMP = VENV / "salient.stamp"
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ def install_packages(dependencies: tuple[Dependency, ...], install: bool) -> Non
         if not done:
             done = _as_root(["apt-get", "update"], output) and _as_root(command, output)
     if not done:
-        fail(f"the Debian packages {' '.join(packages)} could not be installed: see {log.relative_to(ROOT)}")
+        fail(f"the Debian packages {' '.join(packages)} could not be installed: see {from_root(log)}")
     still = [dependency.package for dependency in missing if not dependency.present()]
     if still:
         fail(f"{' '.join(still)}: installed, but the expected files are missing")
@@ -166,7 +165,7 @@ def _as_root(command: list[str], output: BinaryIO) -> bool:
 # --- Python packages ------------------------------------------------------------------------------------------------
 
 def make_environment(install: bool) -> None:
-    """Makes build/venv from the lock file, again when the lock file has changed."""
+    """Makes the virtual environment from the lock file, again when the lock file has changed."""
     packages = hashlib.sha256(LOCK.read_bytes() + str(ROOT).encode()).hexdigest()
     ours = hashlib.sha256(b"".join((TOOLS / name).read_bytes() for name in ("pyproject.toml", "setup.py"))).hexdigest()
     found = STAMP.read_text().split() if STAMP.exists() and (VENV / "bin/python").exists() else []
@@ -175,7 +174,7 @@ def make_environment(install: bool) -> None:
     pip = [str(VENV / "bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
     steps = [[*pip, "--no-build-isolation", "--editable", str(TOOLS)]]
     if found[:1] != [packages]:
-        where = f"{LOCK.relative_to(ROOT)} into {VENV.relative_to(ROOT)} (CAN, plots, tests)"
+        where = f"{from_root(LOCK)} into {from_root(VENV)} (CAN, plots, tests)"
         if not install:
             fail(f"missing: the Python packages of {where}; leave out --no-install")
         print_status(f"installing Python packages of {where}")
@@ -190,7 +189,7 @@ def make_environment(install: bool) -> None:
         for step in steps:
             environment = {**os.environ, "DIST_EXTRA_CONFIG": str(extra)}
             if subprocess.run(step, env=environment, stdout=output, stderr=output, cwd=BUILD).returncode != 0:
-                fail(f"the Python packages could not be installed: {_pip_failure(log)} (see {log.relative_to(ROOT)})")
+                fail(f"the Python packages could not be installed: {_pip_failure(log)} (see {from_root(log)})")
     STAMP.write_text(f"{packages} {ours}\n")
 
 
@@ -218,12 +217,12 @@ def build(preset: str, targets: list[str]) -> bool:
     notices: list[str] = []
 
     def notice() -> None:
-        notices.append(f"building {folder.relative_to(ROOT)}")
+        notices.append(f"building {from_root(folder)}")
         print_status(notices[-1])
 
-    if not build_preset(ROOT, preset, targets, log, notice):
+    if not build_preset(ROOT, folder, targets, log, notice):
         sys.stderr.write(_failures(log.read_text(errors="replace")))
-        print(f"salient: the build failed: see {log.relative_to(ROOT)}", file=sys.stderr)
+        print(f"salient: the build failed: see {from_root(log)}", file=sys.stderr)
         sys.exit(1)
     return bool(notices)
 
@@ -278,13 +277,7 @@ def main() -> int:
     install = not options.no_install
     os.environ["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # compiling NumPy and pydantic at each start takes half a second
-    try:
-        BUILD.mkdir(exist_ok=True)
-        lock = (BUILD / "launcher.lock").open("w")
-    except OSError as error:
-        fail(f"{BUILD}: {error.strerror}; everything is built there")
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # concurrent commands must not build into each other
+    with build_lock():
         # The benchmark counts the instructions of the control interrupt on the Cortex-M4.
         target = "cortex-m4" if options.command == "benchmark" else getattr(options, "build", "host")
         target = getattr(options, "target", target)  # pil

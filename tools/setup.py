@@ -26,14 +26,15 @@ FOLDERS = ("tools/machines", "tools/loads", "tools/scenarios", "tools/examples")
 PROGRAMS = ("salient_host", "salient_reference")
 
 sys.path.insert(0, str(ROOT / "tools" / "src"))
-from salient.version import VERSION  # noqa: E402  (needs the path above)
+from salient.paths import BUILD  # noqa: E402  (needs the path above)
+from salient.version import VERSION  # noqa: E402
 
 
 def build_programs() -> Path:
     """Builds the programs, in the host build where there is one; returns its folder."""
-    folder = ROOT / "build" / "host"
+    folder = BUILD / "host"
     if not (folder / "CMakeCache.txt").exists():
-        folder = ROOT / "build" / "wheel"
+        folder = BUILD / "wheel"
         subprocess.run(["cmake", "-S", ROOT, "-B", folder, "-G", "Ninja", "-DCMAKE_BUILD_TYPE=Release",
                         f"-DSALIENT_PYTHON={sys.executable}"], check=True)
     subprocess.run(["cmake", "--build", folder, "--target", *(f"{name}_static" for name in PROGRAMS)], check=True)

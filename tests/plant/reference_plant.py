@@ -10,12 +10,10 @@ from __future__ import annotations
 import ctypes
 import itertools
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -23,8 +21,8 @@ from scipy.integrate import solve_ivp
 import salient.machine.file
 import salient.machine.flux_map
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
+from salient.paths import BUILD
 
-ROOT = Path(__file__).resolve().parents[2]
 PHASES_MAX = 4
 TICK_NS = 5
 FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
@@ -147,9 +145,8 @@ SAMPLE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 
 
 def load_library() -> ctypes.CDLL:
-    """libsalient_plant.so of the build folder SALIENT_BUILD (default build/host), its functions typed."""
-    build = Path(os.environ.get("SALIENT_BUILD", ROOT / "build" / "host"))
-    plant = ctypes.CDLL(str(build / "lib" / "libsalient_plant.so"))
+    """libsalient_plant.so of the host build, its functions typed."""
+    plant = ctypes.CDLL(str(BUILD / "host" / "lib" / "libsalient_plant.so"))
     pointer, number, integer = ctypes.c_void_p, ctypes.c_double, ctypes.c_uint64
     signatures: dict[str, list[type]] = {
         "plant_library_create": [ctypes.POINTER(Machine), number],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from fmpy.validation import validate_fmu
 from reference_plant import Compare, State, load_library, machine_from
 
 from salient.machine.file import load_machine, machine_path
-from salient.paths import MACHINES, ROOT
+from salient.paths import BUILD, MACHINES, ROOT
 
 OUTPUTS = (
     "current_a_A",
@@ -46,7 +45,7 @@ def library() -> ctypes.CDLL:
 
 
 def unit_path(name: str) -> Path:
-    return Path(os.environ.get("SALIENT_BUILD", ROOT / "build" / "host")) / "fmu" / f"{name}.fmu"
+    return BUILD / "host" / "fmu" / f"{name}.fmu"
 
 
 # --- Runs ---

@@ -11,7 +11,7 @@ from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import RunFailed, UsageError, exit_code
 from salient.light_can import without_mf4
-from salient.paths import BUILD, make_folder, scenario_path
+from salient.paths import BUILD, OUT, make_folder, scenario_path
 
 
 def main() -> int:
@@ -81,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
     from salient.experiments.scenario import load_scenarios, run_all
 
     scenarios = load_scenarios(scenario_path(options.scenario))
-    out = options.out or Path("out") / options.scenario.stem
+    out = options.out or OUT / options.scenario.stem
     make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
                       progress=lambda line: print(line, flush=True))

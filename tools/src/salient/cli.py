@@ -24,13 +24,15 @@ from salient.config import (
     flag_of,
 )
 from salient.errors import close_names
-from salient.paths import BUILD, COMMAND, IS_WHEEL
+from salient.paths import BUILD, COMMAND, IS_WHEEL, OUT, from_root
 from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
 CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay")
 """Commands that need the sources."""
+_SHOWN_OUT, _SHOWN_BUILD = (text.replace("%", "%%") for text in (str(OUT), from_root(BUILD)))
+"""For argparse, which formats a text of help."""
 CHANGE_PERCENT = 10.0
 """Smaller changes of a ripple, which is an extreme of one run, are within its scatter."""
 
@@ -84,7 +86,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
         return made
 
     demo = command("demo", "the paper's two experiments with every controller, with report and CAN logs")
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="folder (default out/demo)")
+    demo.add_argument("--out", type=Path, default=OUT / "demo", metavar="DIR", help="folder (default %(default)s)")
     _add_bench_options(demo, "demo")
     # Options that are not given leave the scenarios of the demo as they are.
     demo.set_defaults(**{name: None for name in CONDITIONS if "demo" in OPTIONS[name].commands})
@@ -101,7 +103,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
 
     run = command("run", "one scenario, to a folder")
     run.add_argument("scenario", type=Path, metavar="SCENARIO.toml")
-    run.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/NAME)")
+    run.add_argument("--out", type=Path, metavar="DIR", help=f"folder (default {_SHOWN_OUT}/NAME)")
     _add_bench_options(run, "run")
 
     log = command("log", "record a running bus until it ends, or is interrupted; or convert a log")
@@ -109,9 +111,9 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     _add_can(source)
     source.add_argument("--convert", type=Path, metavar="FILE",
                         help="instead: the frames of a log, FILE.blf, FILE.asc or FILE.log, into the format of --out")
-    log.add_argument("--out", type=_log_path, default=Path("out/can.blf"), metavar="FILE",
+    log.add_argument("--out", type=_log_path, default=OUT / "can.blf", metavar="FILE",
                      help="FILE.blf, FILE.asc, FILE.mf4 (decoded signals) or FILE.log, candump text (default "
-                     "out/can.blf)")
+                     "%(default)s)")
     log.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
     _add_machine(log, "whose signals FILE.mf4 has: ")
     _add_node(log)
@@ -158,8 +160,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     view.set_defaults(node=None)  # a failed test has noted them
 
     tab = command("tab", "the live page with a drive inside, as one file for a browser: no installation, no server")
-    tab.add_argument("--out", type=Path, default=Path("out/tab.html"), metavar="FILE",
-                     help="the file (default out/tab.html)")
+    tab.add_argument("--out", type=Path, default=OUT / "tab.html", metavar="FILE",
+                     help="the file (default %(default)s)")
     tab.add_argument("--machine", metavar="NAME|FILE", help="one more machine than the bundled ones: a machine file")
 
     benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
@@ -179,8 +181,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     machine = command("machine", "check a machine file, summarise it, list what follows for its drive, draw its "
                       "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
-    machine.add_argument("--out", type=Path, default=Path("out/machine"), metavar="DIR",
-                         help="folder of the plot (default out/machine)")
+    machine.add_argument("--out", type=Path, default=OUT / "machine", metavar="DIR",
+                         help="folder of the plot (default %(default)s)")
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")
@@ -189,7 +191,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     pil = command("pil", "processor in the loop: a scenario on the target, and its load on the processor")
     task = pil.add_mutually_exclusive_group(required=True)
     task.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.toml")
-    pil.add_argument("--out", type=Path, metavar="DIR", help="folder (default out/pil_NAME)")
+    pil.add_argument("--out", type=Path, metavar="DIR", help=f"folder (default {_SHOWN_OUT}/pil_NAME)")
     pil.add_argument("--target", type=_one_of(TARGETS[1:]), default=TARGETS[1], metavar="NAME",
                      help=f"{either(TARGETS[1:])} (default {TARGETS[1]})")
     task.add_argument("--bound", nargs="?", const="all", metavar="VARIANT",
@@ -206,8 +208,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                           help="every N-th seed only, beginning with the I-th; shards may share a folder")
     campaign.add_argument("--scheduler", metavar="ADDRESS",
                           help="Dask scheduler, tcp://HOST:PORT, whose workers have this installation")
-    campaign.add_argument("--out", type=Path, default=Path("out/campaign"), metavar="DIR",
-                          help="folder (default out/campaign); what it has of these seeds is not run again")
+    campaign.add_argument("--out", type=Path, default=OUT / "campaign", metavar="DIR",
+                          help="folder (default %(default)s); what it has of these seeds is not run again")
     campaign.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
     campaign.add_argument("--healthy", action="store_true",
                           help="worlds without faults instead, in which a fault of the drive is a false alarm")
@@ -217,20 +219,20 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                      "log and plot")
     replay.add_argument("what", metavar="SEED|FOLDER")
     replay.add_argument("--healthy", action="store_true", help="the seed is one of campaign --healthy")
-    replay.add_argument("--out", type=Path, default=Path("out/replay"), metavar="DIR",
-                        help="parent of the folder for a seed (default out/replay)")
+    replay.add_argument("--out", type=Path, default=OUT / "replay", metavar="DIR",
+                        help="parent of the folder for a seed (default %(default)s)")
     replay.add_argument("--target", dest="build", type=_one_of(TARGETS), default=TARGETS[0], metavar="NAME",
                         help=f"{either(TARGETS)} (default {TARGETS[0]})")
     wheel = command("wheel", "the Python package with its programs, for suites in other repositories")
-    wheel.add_argument("--out", type=Path, default=Path("out/wheel"), metavar="DIR",
-                       help="folder (default out/wheel)")
+    wheel.add_argument("--out", type=Path, default=OUT / "wheel", metavar="DIR",
+                       help="folder (default %(default)s)")
     wheel.add_argument("--tag", metavar="vX.Y.Z", help="tag of a release: must be that of the version")
 
     scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
                     "plot")
     _add_can(scope)
-    scope.add_argument("--out", type=Path, default=Path("out/scope"), metavar="DIR",
-                       help="folder (default out/scope)")
+    scope.add_argument("--out", type=Path, default=OUT / "scope", metavar="DIR",
+                       help="folder (default %(default)s)")
     _add_machine(scope)
     _add_node(scope)
 
@@ -282,7 +284,7 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 def _add_can(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--can", type=lambda text: text if text == "auto" else _convert("can", text), default="auto",
                         metavar="BUS", help=f"{BUSES}, or auto (default): vcan0 when it is up, else "
-                        f"unix:{'' if IS_WHEEL else 'build/'}salient.sock" + (f" in {BUILD}" if IS_WHEEL else ""))
+                        f"unix:{_SHOWN_BUILD}/salient.sock")
 
 
 def _option_type(name: str) -> Callable[[str], Any]:
@@ -303,8 +305,8 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
                         "speed and its loads of its rated torque, as those of the paper's machine")
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: about 20 s")
-    parser.add_argument("--out", type=Path, default=Path("out/compare"), metavar="DIR",
-                        help="folder (default out/compare)")
+    parser.add_argument("--out", type=Path, default=OUT / "compare", metavar="DIR",
+                        help="folder (default %(default)s)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
                         help="parameter of the drive or variable of the test bench, in every run; may be repeated")
     _add_execution_options(parser)
@@ -336,7 +338,7 @@ def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
                         help="load profile; may be repeated")
     parser.add_argument("--seeds", type=_count, default=1, metavar="N", help="number of seeds (default 1)")
     parser.add_argument("--seed", type=_option_type("seed"), metavar="N", help="the first (default as the scenario)")
-    parser.add_argument("--out", type=Path, default=Path("out/sweep"), metavar="DIR", help="folder (default out/sweep)")
+    parser.add_argument("--out", type=Path, default=OUT / "sweep", metavar="DIR", help="folder (default %(default)s)")
     parser.add_argument("--resume", action="store_true",
                         help="keep the finished runs in the folder; those of shards are always kept")
     _add_execution_options(parser)

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 from salient.errors import UsageError
-from salient.paths import ROOT
+from salient.paths import BUILD, ROOT
 
 _RISCV = 243
 _LOADED = 1
@@ -164,5 +164,7 @@ class ElfImage:
 def _short(file: str) -> str:
     if not file.startswith("/"):
         return "?"
-    path = Path(file).resolve()
+    path, build = Path(file).resolve(), BUILD.resolve()
+    if path.is_relative_to(build):
+        return f"build/{path.relative_to(build).as_posix()}"  # wherever it was built
     return path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else str(path)

@@ -1,19 +1,39 @@
 """Where things are: in the repository that this package is installed from, or in the package itself, a wheel, whose
 folder data/ has the files that are needed in the places that they have in the repository (tools/setup.py)."""
 
+import contextlib
+import fcntl
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 from salient.errors import UsageError, cannot_write, close_names, shown
 
 _DATA = Path(__file__).resolve().parent / "data"
 IS_WHEEL = _DATA.is_dir()
 ROOT = _DATA if IS_WHEEL else _DATA.parents[3]
-BUILD = (Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "salient" if IS_WHEEL
-         else ROOT / "build")
-"""What is made while the tools are used, and in a repository the programs."""
+BUILD_VARIABLE = "SALIENT_BUILD"
+
+
+def _build_folder() -> Path:
+    if IS_WHEEL:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "salient"
+    given = os.environ.get(BUILD_VARIABLE)
+    if not given:
+        return ROOT / "build"
+    # Processes that this one starts in another folder mean the same one.
+    folder = Path(os.path.normpath(Path.cwd() / given))
+    os.environ[BUILD_VARIABLE] = str(folder)
+    return folder
+
+
+BUILD = _build_folder()
+"""What is made while the tools are used, and in a repository the programs: build/ in the repository, or the folder that
+SALIENT_BUILD names, for a repository that cannot be written. Nothing else reads that variable."""
+OUT = Path("out") if BUILD == ROOT / "build" or IS_WHEEL else BUILD / "out"
+"""Parent of the folders of --out that are not given: in the present folder, or where everything else goes."""
 COMMAND = "salient" if IS_WHEEL else "tools/salient"
 PYTHON_PACKAGES = ROOT / "tools" / "requirements.lock"
 MACHINES = ROOT / "tools" / "machines"
@@ -29,6 +49,40 @@ RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"
 def program(build: str, name: str) -> Path:
     """A program of a build, which may not exist; in a wheel all are for the host."""
     return ROOT / "bin" / name if IS_WHEEL else BUILD / build / "bin" / name
+
+
+def from_root(path: Path) -> str:
+    """A path in a message: short for what is in the repository."""
+    return str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path)
+
+
+@contextlib.contextmanager
+def build_lock() -> Iterator[None]:
+    """Makes the build folder and holds its lock: no two commands build at once. UsageError when nothing can be written
+    there, or when it is the folder of another clone, whose packages and programs would be replaced."""
+    with _open_lock():
+        yield
+
+
+def _open_lock() -> TextIO:
+    with contextlib.ExitStack() as stack:
+        try:
+            BUILD.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((BUILD / "launcher.lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            note = BUILD / "clone"
+            owner = Path(os.fsdecode(note.read_bytes())) if note.exists() else ROOT
+            if BUILD != ROOT / "build" and owner != ROOT and (owner / "tools").is_dir():
+                raise UsageError(f"{BUILD_VARIABLE} {BUILD}: another clone is built there, {owner}; each needs a "
+                                 "folder of its own")
+            if owner != ROOT or not note.exists():
+                note.write_bytes(os.fsencode(ROOT))
+        except OSError as error:
+            reason = ("not a folder" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror)
+            raise UsageError(f"{BUILD}: {reason}; everything is built there, or in a writable folder that "
+                             f"{BUILD_VARIABLE} names") from None
+        stack.pop_all()
+        return lock
 
 
 def make_folder(out: Path, removed: Sequence[str] = ()) -> None:

@@ -12,7 +12,7 @@ import zipfile
 from pathlib import Path
 
 from salient.errors import RunFailed, UsageError
-from salient.paths import BUILD, ROOT, make_folder
+from salient.paths import BUILD, ROOT, from_root, make_folder
 from salient.version import VERSION
 
 
@@ -67,7 +67,7 @@ def build(out: Path, tag: str | None = None) -> int:
         done = subprocess.run(command, env={**os.environ, "DIST_EXTRA_CONFIG": str(extra)}, stdin=subprocess.DEVNULL,
                               stdout=output, stderr=subprocess.STDOUT)
         if done.returncode != 0:
-            raise RunFailed(f"the wheel could not be built: see {log.relative_to(ROOT)}")
+            raise RunFailed(f"the wheel could not be built: see {from_root(log)}")
         [made] = (folder / "wheel").iterdir()
         check_metadata(made)
         check_platform(made)

@@ -21,7 +21,7 @@ from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
 from salient.machine.cache import content_key, machine_image
 from salient.machine.path import machine_path
-from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, program
+from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, build_lock, from_root, program
 
 _BUILDERS = {"host": "any tools/salient command",
              "debug": "cmake --preset debug && cmake --build --preset debug",
@@ -99,7 +99,7 @@ def _builder(build: str) -> str:
 def _built(build: str, name: str, builder: str) -> Path:
     path = program(build, name)
     if not path.exists():
-        raise UsageError(f"{path.relative_to(ROOT)} is not built; {builder} builds it")
+        raise UsageError(f"{from_root(path)} is not built; {builder} builds it")
     return path
 
 
@@ -127,15 +127,14 @@ def _build_custom(path: Path, key: str, build: str) -> Path:
             print(f"salient: building the firmware for {path}", file=sys.stderr, flush=True)
 
         if not (_build_parts(build, log, notice) and run_commands(commands, ROOT, log, notice)):
-            raise EmulatorError(f"building the firmware for {path} failed: see {log.relative_to(ROOT)}")
+            raise EmulatorError(f"building the firmware for {path} failed: see {from_root(log)}")
     return folder / build / "bin" / "salient_custom.elf"
 
 
 def _build_parts(build: str, log: Path, notice: Callable[[], None]) -> bool:
     """Brings what the images of a target build link up to date; no two commands build at once."""
-    with (BUILD / "launcher.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        return build_preset(ROOT, build, _IMAGE_PARTS, log, notice)
+    with build_lock():
+        return build_preset(ROOT, BUILD / build, _IMAGE_PARTS, log, notice)
 
 
 def _remove_orphans() -> None:

@@ -17,7 +17,7 @@ from salient.bench.bench import Bench
 from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.machine.file import load_machine, machine_path
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, from_root
 
 TICK_NS = 5
 """PWM_TIMER_TICK_NS of emulator/plant/pwm_timer.h."""
@@ -150,7 +150,7 @@ def program(machine: str) -> Path:
     """Executable of the plant alone for a bundled machine; UsageError when it is not built."""
     path = BUILD / "host" / "bin" / f"plant_benchmark_{machine}"
     if not path.exists():
-        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient benchmark builds it")
+        raise UsageError(f"{from_root(path)} is not built; tools/salient benchmark builds it")
     return path
 
 

@@ -34,7 +34,7 @@ from salient.errors import UsageError, exit_code
 from salient.experiments import tasks
 from salient.experiments.campaign.failure import classes, save
 from salient.experiments.campaign.runner import Programs, commit, processor_s, run_world, run_worlds
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, OUT, ROOT
 from salient.progress import Progress, steps_of
 
 TABLE = ROOT / "tests" / "planted.toml"
@@ -391,7 +391,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=[""], metavar="PART", help="bugs with one of these in their name")
     parser.add_argument("--by", nargs="+", default=KINDS, choices=KINDS, help="look with these only (default all)")
     parser.add_argument("--seeds", type=int, default=SEEDS_MAX, help=f"for a bug at most (default {SEEDS_MAX})")
-    parser.add_argument("--out", type=Path, default=Path("out/planted"), metavar="DIR", help="default out/planted")
+    parser.add_argument("--out", type=Path, default=OUT / "planted", metavar="DIR", help=f"default {OUT}/planted")
     parser.add_argument("--list", action="store_true", help="only name the bugs")
     options = parser.parse_args()
     chosen = [bug for bug in bugs() if any(part in bug.name for part in options.only)

@@ -6,7 +6,6 @@ import base64
 import struct
 import zlib
 from collections import Counter
-from pathlib import Path
 
 import can
 
@@ -14,10 +13,10 @@ from salient.bench.bench import Bench
 from salient.bus.interface import CAN_EFF_FLAG
 from salient.config import DEFAULTS
 from salient.machine.path import machine_path
-from salient.paths import IS_WHEEL, MACHINES
+from salient.paths import IS_WHEEL, MACHINES, OUT
 from salient.tab.build_id import build_id
 
-FILE = Path("out/tab.html")
+FILE = OUT / "tab.html"
 LENGTH_MAX = 16_000
 """Characters of a link that terminals and browsers still take."""
 _FRAME = struct.Struct("<QIB")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from salient.experiments.scenario import RunResult, check_parameters, load_scenarios, write_summaries
-from salient.paths import make_folder, scenario_path
+from salient.paths import OUT, make_folder, scenario_path
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, PROCESSOR_HZ, estimable, fits
 from salient.target.isr_profile import IsrProfile, measure_run
 from salient.target.pil_report import write_pil_report
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> int:
 
         known = baseline.read()["interrupt"] if estimable(options.target) else {}
         return bound_report.run(options.bound, options.target, {name: of["longest_run"] for name, of in known.items()})
-    return _run_scenario(options.scenario, options.out or Path("out") / f"pil_{options.scenario.stem}", options.target)
+    return _run_scenario(options.scenario, options.out or OUT / f"pil_{options.scenario.stem}", options.target)
 
 
 def as_json(profile: IsrProfile, target: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Debian's kernel, its modules for CAN and 9p, and a busybox for the VM: downloaded once and kept under build/vm.
+"""Debian's kernel, its modules for CAN and 9p, and a busybox for the VM: downloaded once and kept in the build folder.
 
 Nothing is installed: the packages are fetched with `apt-get download`, which needs no root, and only the files
 that the VM loads are kept (67 MB of the kernel's 400 MB).

@@ -44,7 +44,7 @@ from salient.experiments.planted import Bug, bugs, build, build_unchanged
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
 from salient.machine.cache import machine_image
-from salient.paths import ROOT
+from salient.paths import OUT, ROOT
 from salient.progress import Progress, steps_of
 
 TABLE = ROOT / "tests" / "ablation.toml"
@@ -167,7 +167,7 @@ def main() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--only", nargs="+", default=[""], metavar="NAME",
                         help="mechanisms with one of these in their name")
-    parser.add_argument("--out", type=Path, default=Path("out/ablation"), metavar="DIR", help="default out/ablation")
+    parser.add_argument("--out", type=Path, default=OUT / "ablation", metavar="DIR", help=f"default {OUT}/ablation")
     parser.add_argument("--program", type=Path, metavar="FILE",
                         help="a salient_host of other sources instead of the mechanisms, against the present build")
     parser.add_argument("--runs", type=int, default=COUNT, metavar="N", help=f"number of runs (default {COUNT})")

@@ -17,7 +17,7 @@ from salient.bench.programs import EmulatorError
 from salient.errors import UsageError
 from salient.experiments.campaign.machines import pool_file
 from salient.experiments.tasks import check_build
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, ROOT, from_root
 
 Result = dict[str, Any]
 """seed, hash, machine, controller, virtual_us, causes, recovered, held, violations, cells."""
@@ -36,7 +36,7 @@ def program() -> Path:
     """UsageError: it is not built."""
     path = BUILD / "host" / "bin" / "salient_campaign"
     if not path.exists():
-        raise UsageError(f"{path.relative_to(ROOT)} is not built; tools/salient campaign builds it")
+        raise UsageError(f"{from_root(path)} is not built; tools/salient campaign builds it")
     return path
 
 
