@@ -94,7 +94,7 @@ def environment() -> dict[str, str]:
 @contextlib.contextmanager
 def running_drive(bus: Path, *, faulty: bool) -> Iterator[None]:
     """A drive of this checkout on a bus; faulty: after a fault."""
-    command = [sys.executable, "-m", "salient", "sim", "--can", f"unix:{bus}", "--pace", "x0.5"]
+    command = [ROOT / "tools" / "salient", "sim", "--can", f"unix:{bus}", "--pace", "x0.5"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as drive:
         assert drive.stdout is not None and json.loads(drive.stdout.readline())["ready"]
         try:
@@ -165,6 +165,8 @@ def run(root: Path, folder: Path, cases: dict[str, list[str]]) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     results, commit = folder / "results.jsonl", commit_of(root)
     passed = read_passed(results, commit)
+    if subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root).returncode != 0:
+        print("changes that are not committed are in no clone", flush=True)
     summary = []
     for command, lines in cases.items():
         if command in passed:
