@@ -99,18 +99,19 @@ def _log(options: argparse.Namespace) -> int:
 
         if options.duration_s is not None:
             raise UsageError("--duration-s: not with --convert, which reads the whole file")
-        count = convert(options.convert, options.out, options.machine, options.node)
-        print(f"{count} frames: {options.out}")
+        count, place = convert(options.convert, options.out, options.machine, options.node, options.rotate)
+        print(f"{count} frames: {place}")
         return 0
     from salient.bus.monitor import record
 
-    return record(options.can, options.out, options.duration_s, options.machine, options.node)
+    return record(options.can, options.out, options.duration_s, options.machine, options.node, options.rotate)
 
 
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node)
+    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node,
+                   options.replay)
 
 
 def _command(options: argparse.Namespace) -> int:

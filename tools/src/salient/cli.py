@@ -18,7 +18,9 @@ from salient.config import (
     FLAG,
     LOG_SUFFIXES,
     OPTIONS,
+    READABLE_SUFFIXES,
     TARGETS,
+    Rotation,
     description,
     either,
     flag_of,
@@ -110,16 +112,21 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     source = log.add_mutually_exclusive_group()
     _add_can(source)
     source.add_argument("--convert", type=Path, metavar="FILE",
-                        help="instead: the frames of a log, FILE.blf, FILE.asc or FILE.log, into the format of --out")
+                        help=f"instead: the frames of a log ({', '.join(READABLE_SUFFIXES)}; also with .gz), into "
+                        "the format of --out")
     log.add_argument("--out", type=_log_path, default=OUT / "can.blf", metavar="FILE",
-                     help="FILE.blf, FILE.asc, FILE.mf4 (decoded signals) or FILE.log, candump text (default "
-                     "%(default)s)")
+                     help="FILE.blf, FILE.asc, FILE.log (candump text), or decoded signals: FILE.mf4, FILE.csv, "
+                     "FILE.parquet (default %(default)s)")
+    log.add_argument("--rotate", type=_rotation, metavar="SIZE|TIME",
+                     help="continue in FILE_0002 and so on after this size or time, as 100MB or 10min")
     log.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
-    _add_machine(log, "whose signals FILE.mf4 has: ")
+    _add_machine(log, "whose signals are decoded: ")
     _add_node(log)
 
-    monitor = command("monitor", "watch a running drive, one line of values per period")
-    _add_can(monitor)
+    monitor = command("monitor", "watch a running drive, or a log, one line of values per period")
+    watched = monitor.add_mutually_exclusive_group()
+    _add_can(watched)
+    watched.add_argument("--replay", type=Path, metavar="FILE", help="instead: a log, as log --convert reads it")
     monitor.add_argument("--every-s", type=_positive, default=0.1, metavar="X",
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
@@ -154,7 +161,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     shown = view.add_mutually_exclusive_group()
     _add_can(shown)
     shown.add_argument("--replay", type=Path, metavar="FILE",
-                       help="instead: a log, FILE.blf, FILE.asc or FILE.log, or the folder of a failed test")
+                       help="instead: a log, as log --convert reads it, or the folder of a failed test")
     _add_machine(view, "whose poles and signals are shown: ")
     _add_node(view)
     view.set_defaults(node=None)  # a failed test has noted them
@@ -419,6 +426,13 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def _rotation(text: str) -> Rotation:
+    try:
+        return Rotation.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text}: {error}") from None
 
 
 def _log_path(text: str) -> Path:

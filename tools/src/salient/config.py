@@ -32,8 +32,32 @@ PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
 """PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
 NODE_MAX = 7
 BUSES = "unix:PATH or socketcan:INTERFACE"
-LOG_SUFFIXES = (".asc", ".mf4", ".blf", ".log")
-"""Formats of a log: ASC, MF4, BLF and the text of candump -L."""
+LOG_SUFFIXES = (".asc", ".mf4", ".csv", ".parquet", ".blf", ".log")
+"""Formats of a log that is written: ASC, BLF and the text of candump -L, and MF4, CSV and Parquet of signals."""
+READABLE_SUFFIXES = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc", ".txt")
+"""Formats of a log that is read."""
+ROTATION_UNITS = {"kB": 1000, "MB": 1000**2, "GB": 1000**3, "s": 1_000_000_000, "min": 60_000_000_000,
+                  "h": 3_600_000_000_000}
+"""Bytes or nanoseconds of a unit."""
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a log continues in another file: after as many bytes, or as much time between its frames."""
+
+    limit: int
+    is_time: bool
+
+    @staticmethod
+    def parse(text: str) -> Rotation:
+        """Of 100MB or 10min; ValueError names what is allowed."""
+        match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?) ?([a-zA-Z]+)", text, re.ASCII)
+        units = {unit.lower(): unit for unit in ROTATION_UNITS}
+        unit = units.get(match[2].lower()) if match else None
+        if match is None or unit is None or float(match[1]) <= 0.0:
+            raise ValueError(f"must be a size or a time above 0, in {either(ROTATION_UNITS)}, as 100MB or 10min")
+        return Rotation(max(1, round(float(match[1]) * ROTATION_UNITS[unit])), unit in ("s", "min", "h"))
+
 
 FLAG, INTEGER, NUMBER, WORD, FILE, BUS, PACE = "flag", "integer", "number", "word", "file", "bus", "pace"
 MACHINE = "machine"

@@ -37,6 +37,19 @@ def nodes_of_drives() -> Mapping[int, int]:
             if "DRIVE" in message.senders for node in range(NODE_MAX + 1)}
 
 
+@lru_cache
+def nodes_of_messages() -> Mapping[tuple[int, bool, int], frozenset[int]]:
+    """The node numbers of the drives that send or take a message, or whose test bench does, by its identifier, whether
+    that is extended, and its length."""
+    found: dict[tuple[int, bool, int], set[int]] = {}
+    for database, step in ((drive_database(), NODE_STEP), (rig_database(), RIG_NODE_STEP)):
+        for message in database.messages:
+            for node in range(NODE_MAX + 1):
+                identifier = message.frame_id + (0 if message.name in RIG_OF_ALL else step * node)
+                found.setdefault((identifier, message.is_extended_frame, message.length), set()).add(node)
+    return {key: frozenset(nodes) for key, nodes in found.items()}
+
+
 def has_plain_data(message: can.Message) -> bool:
     """Whether a frame is of the kind that drives and rigs transmit."""
     return not (message.is_fd or message.is_error_frame or message.is_remote_frame)

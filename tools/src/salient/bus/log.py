@@ -1,45 +1,113 @@
-"""Logs on virtual time, in the format of their suffix: BLF (every kind of frame, nanoseconds), ASC and candump text (to
-be read, and to be compared; microseconds), MF4 (signals instead of frames)."""
+"""Logs, in the format of their suffix: BLF (every kind of frame, nanoseconds), ASC and candump text (to be read, and to
+be compared; microseconds), and decoded signals instead of frames: MF4, CSV and Parquet."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Protocol
 
 import can
-from can.io import ASCWriter, BLFWriter
+from can.io import ASCWriter, BLFWriter, blf
 from can.util import len2dlc
 
-from salient.config import LOG_SUFFIXES, either
-from salient.errors import UsageError
+from salient.bus.identity import Carrier
+from salient.config import LOG_SUFFIXES, Rotation, either
+from salient.errors import RunFailed, UsageError
 
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MS_NS = 1_000_000
 _ASC_START = "Thu Jan 1 00:00:00.000 1970"
 """Virtual time has no date."""
+_BLF_START_OFFSET = 40
+"""Of the start in the header of a file."""
+_NUMBER_DIGITS = 4  # of a file of a rotated log
+DECODED_SUFFIXES = (".mf4", ".csv", ".parquet")
 
 
 class Log(Protocol):
-    """A log file that is being written."""
+    """A log that is being written."""
 
     def write(self, time_ns: int, message: can.Message) -> None:
-        """Appends a frame; times do not fall."""
+        """Appends a frame."""
 
     def close(self) -> None:
         """Completes the file."""
 
+    def discard(self) -> None:
+        """Completes and removes what was written."""
 
-class BlfLog:
-    """A BLF file whose bytes depend on the frames and their virtual times alone."""
+    @property
+    def size(self) -> int:
+        """Bytes until now; of a format that is compressed later, those before it is."""
+
+    @property
+    def place(self) -> str:
+        """The file, or the first and the last of several."""
+
+
+class FileLog:
+    """A log in one file."""
 
     def __init__(self, path: Path) -> None:
-        self._writer = BLFWriter(path)
-        # Otherwise the first frame's time becomes the origin, and its fraction of a millisecond is lost.
+        self.path = path
+
+    @property
+    def place(self) -> str:
+        return str(self.path)
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def discard(self) -> None:
+        """Completes and removes the file."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+class _BlfWriter(BLFWriter):
+    """The writer of python-can with times in whole nanoseconds: as floats, those since 1970 lose 256 ns."""
+
+    time_ns = 0
+    """Of the next frame, from the start."""
+
+    def _add_object(self, obj_type: int, data: bytes, timestamp: float | None = None) -> None:
+        header_size = blf.OBJ_HEADER_BASE_STRUCT.size + blf.OBJ_HEADER_V1_STRUCT.size
+        self._buffer += [
+            blf.OBJ_HEADER_BASE_STRUCT.pack(b"LOBJ", header_size, 1, header_size + len(data), obj_type),
+            blf.OBJ_HEADER_V1_STRUCT.pack(blf.TIME_ONE_NANS, 0, 0, self.time_ns),
+            data,
+            bytes(len(data) % 4),
+        ]
+        self._buffer_size += header_size + len(data) + len(data) % 4
+        self.object_count += 1
+        self.stop_timestamp = timestamp
+        if self._buffer_size >= self.max_container_size:
+            self._flush()
+
+
+class BlfLog(FileLog):
+    """A BLF file whose bytes depend on the frames and their times alone. A log that begins before time 0 has the time
+    of its first frame, in whole milliseconds, as its start."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._writer = _BlfWriter(path)
         self._writer.start_timestamp = 0.0
+        self._start_ns: int | None = None
 
     def write(self, time_ns: int, message: can.Message) -> None:
-        plain = can.Message(
-            # The writer truncates to whole nanoseconds: half of one is added against the rounding of the float.
-            timestamp=(time_ns + 0.5) * 1e-9,
+        """Appends a frame. RunFailed: its time is before the start, which BLF cannot have."""
+        if self._start_ns is None:
+            self._start_ns = min(0, time_ns // _MS_NS * _MS_NS)
+        if time_ns < self._start_ns:
+            raise RunFailed(f"--out {self.path}: BLF has no time before its start, as {time_ns * 1e-9:.6f} s is; "
+                            ".log and .asc have")
+        self._writer.time_ns = time_ns - self._start_ns
+        self._writer.on_message_received(can.Message(
+            timestamp=time_ns * 1e-9,
             arbitration_id=message.arbitration_id,
             is_extended_id=message.is_extended_id,
             is_remote_frame=message.is_remote_frame,
@@ -49,42 +117,71 @@ class BlfLog:
             error_state_indicator=message.error_state_indicator,
             dlc=message.dlc,
             data=message.data,
-        )
-        self._writer.on_message_received(plain)
+        ))
+
+    @property
+    def size(self) -> int:
+        return self._writer.file_size()
 
     def close(self) -> None:
         self._writer.stop()
+        if self._start_ns:  # python-can has no date before 1990
+            start = _EPOCH + timedelta(milliseconds=self._start_ns // _MS_NS)
+            with self.path.open("r+b") as file:
+                file.seek(_BLF_START_OFFSET)
+                file.write(struct.pack("<8H", start.year, start.month, start.isoweekday() % 7, start.day, start.hour,
+                                       start.minute, start.second, start.microsecond // 1000))
+            self._start_ns = 0
 
 
-class AscLog:
+class TextLog(FileLog):
+    """A log of one line for each frame."""
+
+    def __init__(self, path: Path, header: str = "") -> None:
+        super().__init__(path)
+        self._file = path.open("w", encoding="utf-8", newline="\n")
+        self._size = self._file.write(header)
+
+    def add(self, text: str) -> None:
+        """Appends text."""
+        self._size += self._file.write(text)
+
+    @property
+    def size(self) -> int:
+        return self._size
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class AscLog(TextLog):
     """An ASC file, all frames received on channel 1. The writer of python-can notes the time of day and counts from the
     first frame."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="ascii", newline="\n")
-        self._file.write(f"date {_ASC_START}\nbase hex  timestamps absolute\ninternal events logged\n"
+        super().__init__(path, f"date {_ASC_START}\nbase hex  timestamps absolute\ninternal events logged\n"
                          f"Begin Triggerblock {_ASC_START}\n   0.000000 Start of measurement\n")
 
     def write(self, time_ns: int, message: can.Message) -> None:
-        self._file.write(f"{_microseconds(time_ns):>11} {_asc_event(message)}\n")
+        """Appends a frame."""
+        self.add(f"{_microseconds(time_ns):>11} {_asc_event(message)}\n")
 
     def close(self) -> None:
-        self._file.write("End TriggerBlock\n")
-        self._file.close()
+        if not self._file.closed:
+            self.add("End TriggerBlock\n")
+        super().close()
 
 
-class CandumpLog:
+class CandumpLog(TextLog):
     """Text as `candump -L` writes it: (seconds.microseconds) interface identifier#data."""
 
     def __init__(self, path: Path, interface: str = "can0") -> None:
-        self._file = path.open("w", encoding="ascii", newline="\n")
+        super().__init__(path)
         self._interface = interface
 
     def write(self, time_ns: int, message: can.Message) -> None:
-        self._file.write(candump_line(time_ns, message, self._interface) + "\n")
-
-    def close(self) -> None:
-        self._file.close()
+        """Appends a frame."""
+        self.add(candump_line(time_ns, message, self._interface) + "\n")
 
 
 def candump_line(time_ns: int, message: can.Message, interface: str = "can0") -> str:
@@ -104,8 +201,8 @@ def candump_line(time_ns: int, message: can.Message, interface: str = "can0") ->
 
 def _microseconds(time_ns: int) -> str:
     """Seconds, cut off to microseconds."""
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    return f"{seconds}.{nanoseconds // 1000:06d}"
+    seconds, microseconds = divmod(abs(time_ns) // 1000, 1_000_000)
+    return f"{'-' if time_ns <= -1000 else ''}{seconds}.{microseconds:06d}"
 
 
 def _asc_event(message: can.Message) -> str:
@@ -126,21 +223,82 @@ def _asc_event(message: can.Message) -> str:
         channel=1, id=identifier, dir="Rx", dtype=f"{kind} {message.dlc:x}", data=data).rstrip()
 
 
-def open_log(path: Path, machine: str | None = None, node: int = 0, source: str = "") -> Log:
-    """A log file by its suffix. machine, node: those whose DBC decodes the frames of an MF4 file, by default the
-    machine that the drive reports. source: of the frames, for messages. UsageError: the suffix is none of
-    LOG_SUFFIXES, or the file cannot be made."""
+class RotatingLog:
+    """A log that continues in another file, FILE_0001, FILE_0002, ..., when one has its size or its time; each is
+    complete. A frame is in one of them."""
+
+    def __init__(self, path: Path, rotation: Rotation, make: Callable[[Path], Log]) -> None:
+        self._path, self._rotation, self._make = path, rotation, make
+        self._files = 0
+        self._finished = 0
+        self._first_ns: int | None = None
+        self._log = self._next()
+
+    def _next(self) -> Log:
+        self._files += 1
+        return self._make(self._file(self._files))
+
+    def _file(self, number: int) -> Path:
+        return self._path.with_stem(f"{self._path.stem}_{number:0{_NUMBER_DIGITS}d}")
+
+    def write(self, time_ns: int, message: can.Message) -> None:
+        """Appends a frame, to the next file when this one is full."""
+        if self._first_ns is None:
+            self._first_ns = time_ns
+        elif (time_ns - self._first_ns if self._rotation.is_time else self._log.size) >= self._rotation.limit:
+            self._finished += self._log.size
+            self._log.close()
+            self._log, self._first_ns = self._next(), time_ns
+        self._log.write(time_ns, message)
+
+    @property
+    def size(self) -> int:
+        return self._finished + self._log.size
+
+    @property
+    def place(self) -> str:
+        first, last = self._file(1), self._file(self._files)
+        return str(first) if first == last else f"{first} to {last.name}"
+
+    def close(self) -> None:
+        self._log.close()
+
+    def discard(self) -> None:
+        """Completes and removes all files."""
+        self._log.discard()
+        for number in range(1, self._files):
+            self._file(number).unlink(missing_ok=True)
+
+
+def open_log(path: Path, machine: str | None = None, node: int = 0, source: str = "",
+             rotation: Rotation | None = None) -> Log:
+    """A log by its suffix. machine, node: those whose DBC decodes the frames of MF4, CSV and Parquet, by default the
+    machine that the drive reports. source: of the frames, for messages. rotation: see RotatingLog. UsageError: the
+    suffix is none of LOG_SUFFIXES, or the file cannot be made."""
     if path.suffix not in LOG_SUFFIXES:
         raise UsageError(f"--out {path}: the suffix must be {either(LOG_SUFFIXES)}")
-    try:
-        if path.suffix == ".mf4":
-            from salient.bus.mf4 import Mf4Log  # asammdf loads pandas: a second that only this format needs
+    carrier = Carrier(source or str(path), machine, node) if path.suffix in DECODED_SUFFIXES else None
 
-            return Mf4Log(path, machine, node, source or str(path))
+    def make(file: Path) -> Log:
+        if carrier is not None:
+            return _decoded_log(file, carrier, node, source or str(path))
         formats: dict[str, Callable[[Path], Log]] = {".blf": BlfLog, ".asc": AscLog, ".log": CandumpLog}
-        return formats[path.suffix](path)
+        return formats[path.suffix](file)
+
+    try:
+        return make(path) if rotation is None else RotatingLog(path, rotation, make)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
+
+
+def _decoded_log(path: Path, carrier: Carrier, node: int, source: str) -> Log:
+    if path.suffix == ".mf4":
+        from salient.bus.mf4 import Mf4Log  # asammdf loads pandas: a second that only this format needs
+
+        return Mf4Log(path, carrier, node, source)
+    from salient.bus.signal_tables import CsvLog, ParquetLog
+
+    return (CsvLog if path.suffix == ".csv" else ParquetLog)(path, carrier, node, source)
 
 
 def write_logs(frames: Iterable[tuple[int, can.Message]], *paths: Path) -> None:

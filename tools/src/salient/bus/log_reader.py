@@ -1,129 +1,177 @@
-"""Frames of a log file, and the conversion of a log into another format."""
+"""Frames of a log file, and the conversion of a log into another format. Every command that reads logs does it here."""
 
 from __future__ import annotations
 
-import re
-import struct
-import zlib
-from collections.abc import Callable, Iterator
+import contextlib
+import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
-from can.io import ASCReader, BLFReader
-from can.io.blf import BLFParseError
-from can.util import len2dlc
 
-from salient.bus.log import open_log
-from salient.config import LOG_SUFFIXES, either
-from salient.errors import UsageError
+from salient.bus.blf_reader import read_blf
+from salient.bus.clock import has_plain_data, nodes_of_messages
+from salient.bus.log import DECODED_SUFFIXES, open_log
+from salient.bus.log_input import Damage, LogInput
+from salient.bus.text_logs import Frames, nanoseconds, read_text
+from salient.config import READABLE_SUFFIXES, Rotation, either
+from salient.errors import RunFailed, UsageError
 
-_READABLE = tuple(suffix for suffix in LOG_SUFFIXES if suffix != ".mf4")
-_CANDUMP = re.compile(
-    r"\((?P<s>\d+)\.(?P<fraction>\d{1,9})\) \S+ (?P<identifier>[\dA-F]{3}|[\dA-F]{8})#"
-    r"(?:#(?P<flags>[\dA-F])(?P<flexible>(?:[\dA-F]{2}){0,64})"
-    r"|(?:R(?P<remote>[0-8]?)|(?P<data>(?:[\dA-F]{2}){0,8}))(?:_(?P<raw_length>[9A-F]))?)(?: [RT])?\n",
-    re.ASCII | re.IGNORECASE)
-_ERROR_FLAG = 0x20000000
-_ASC_END = b"end triggerblock"
+_TIME_MAX_NS = 1 << 62  # a century and a half; the columns of signals have 64 bits
 
 
-class _Truncated(Exception):
-    """The end of a log is missing."""
+class LogDamaged(RunFailed):
+    """A log was read up to its damage, or without what is no frame of it; the text says where, and how many frames
+    there were."""
 
 
-def convert(source: Path, target: Path, machine: str | None, node: int = 0) -> int:
-    """Writes the frames of a log to another, whose suffix is the format; returns their number. UsageError: a file
-    cannot be read or written, or is truncated; OtherDatabase: see Carrier; then there is no target."""
+class NoKnownFrame(RunFailed):
+    """A log has no frame of a drive or its test bench."""
+
+
+class KnownFrames:
+    """Whether the frames of a log are those of a drive or its test bench, with a node number or any (None)."""
+
+    def __init__(self, node: int | None) -> None:
+        self._node = node
+        self._others: set[int] = set()
+        self._count = 0
+        self.found = False
+
+    def add(self, message: can.Message) -> None:
+        """Takes a frame."""
+        self._count += 1
+        if self.found or not has_plain_data(message):
+            return
+        key = (message.arbitration_id, message.is_extended_id, len(message.data))
+        nodes = nodes_of_messages().get(key, frozenset())
+        self.found = bool(nodes) if self._node is None else self._node in nodes
+        if not self.found and len(nodes) == 1:  # the time of the test bench is that of all drives
+            self._others |= nodes
+
+    def require(self, where: str, end: str = "") -> None:
+        """NoKnownFrame: there was none. end: of the message."""
+        if self.found:
+            return
+        node = "" if self._node is None else f" with node number {self._node} (--node)"
+        others = f", but of node {' and '.join(map(str, sorted(self._others)))}" if self._others else ""
+        raise NoKnownFrame(f"{where}: none of {self._count} frames is of a drive{node}{others}{end}")
+
+
+def convert(source: Path, target: Path, machine: str | None, node: int = 0, rotation: Rotation | None = None
+            ) -> tuple[int, str]:
+    """Writes the frames of a log to another, whose suffix is the format; returns their number and the place.
+    rotation: see open_log.
+
+    UsageError: a file cannot be read or written; OtherDatabase: see Carrier; then there is no target. LogDamaged: see
+    read_log; the target has the frames before. NoKnownFrame: there is none of a drive, and of a format with decoded
+    signals no target either.
+    """
     if source.resolve() == target.resolve():
         raise UsageError(f"--out {target}: must be another file than --convert {source}")
     frames = read_log(source)
     first = next(frames, None)  # a file of another format leaves an existing target as it is
+    if first is None:
+        raise NoKnownFrame(f"--convert {source}: the log has no frame")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
-    log = open_log(target, machine, node, str(source))
-    count = 0
+    decodes = target.suffix in DECODED_SUFFIXES
+    known = KnownFrames(node if decodes else None)
+    log = open_log(target, machine, node, str(source), rotation)
+    count, damage = 0, ""
     try:
-        while first is not None:
-            log.write(*first)
-            count += 1
-            first = next(frames, None)
-        log.close()
-    except UsageError:
-        log.close()
-        target.unlink(missing_ok=True)
+        try:
+            while first is not None:
+                log.write(*first)
+                known.add(first[1])
+                count += 1
+                first = next(frames, None)
+        except LogDamaged as error:
+            damage = str(error)
+        if decodes and not known.found:
+            log.discard()
+        else:
+            log.close()
+    except (UsageError, RunFailed):
+        log.discard()
         raise
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
-    return count
+    known.require(damage or f"--convert {source}", "" if decodes else f"; they are in {log.place}")
+    if damage:
+        raise LogDamaged(f"{damage}, which are in {log.place}")
+    return count, log.place
 
 
 def read_log(path: Path, option: str = "--convert") -> Iterator[tuple[int, can.Message]]:
-    """Time in ns and frame, in the order of the file. UsageError: the suffix, the file or its content is none that can
-    be read, or the end is missing; it begins with the option."""
-    if path.suffix not in _READABLE:
-        reason = " (MF4 has signals, no frames)" if path.suffix == ".mf4" else ""
-        raise UsageError(f"{option} {path}: the suffix must be {either(_READABLE)}{reason}")
-    read: Callable[[Path], Iterator[tuple[int, can.Message]]]
-    read = {".blf": _read_blf, ".asc": _read_asc, ".log": _read_candump}[path.suffix]
+    """Time in ns and frame, in the order of the file.
+
+    UsageError: the suffix or the file is none that can be read, or no frame is before its damage; LogDamaged, after the
+    frames that can be read: the rest cannot be, or something that is no frame was left out. Both begin with the option.
+    The work and the memory are bounded by the size of the file, the memory of text, BLF and what is compressed by a
+    constant.
+    """
+    suffix = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    if suffix not in READABLE_SUFFIXES:
+        raise UsageError(f"{option} {path}: the suffix must be {either(READABLE_SUFFIXES)}, or one of them and .gz")
+    count = 0
+    left_out = ""
     try:
-        yield from read(path)
-    except _Truncated as error:
-        raise UsageError(f"{option} {path}: truncated: {error}") from None
+        with contextlib.closing(LogInput(path)) as file:
+            for time_ns, message in _frames(file, path, suffix):
+                _check(time_ns, message, count)
+                yield time_ns, message
+                count += 1
+            left_out = file.left_out
+    except Damage as damage:
+        if count == 0:
+            raise UsageError(f"{option} {path}: not readable as {suffix}: {damage}") from None
+        raise LogDamaged(f"{option} {path}: {damage}; {count} frames before") from None
     except OSError as error:
-        raise UsageError(f"{option} {path}: {error.strerror}") from None
-    except (BLFParseError, struct.error, zlib.error, ValueError, IndexError) as error:
-        raise UsageError(f"{option} {path}: not readable as {path.suffix}: {error or 'unknown content'}") from None
+        raise UsageError(f"{option} {path}: {error.strerror or error}") from None
+    if left_out:
+        raise LogDamaged(f"{option} {path}: {left_out}; {count} frames")
 
 
-def _read_blf(path: Path) -> Iterator[tuple[int, can.Message]]:
-    size = path.stat().st_size
-    with BLFReader(path) as reader:
-        if reader.file_size != size:
-            raise _Truncated(f"its header states {reader.file_size} bytes, the file has {size}")
-        for message in reader:
-            yield round(message.timestamp * 1e9), message
+def _frames(file: LogInput, path: Path, suffix: str) -> Frames:
+    if suffix == ".blf":
+        return read_blf(file)
+    if suffix == ".mf4":
+        from salient.bus.mf4_reader import read_mf4  # asammdf loads pandas: a second that only this format needs
+
+        return read_mf4(file, path)
+    if suffix == ".db":
+        return _read_database(path)
+    return read_text(file, suffix)
 
 
-def _read_asc(path: Path) -> Iterator[tuple[int, can.Message]]:
-    with path.open("rb") as file:
-        if not file.read(5).lower() == b"date ":
-            raise ValueError("it does not begin with a date")
-        size = path.stat().st_size
-        file.seek(max(0, size - 200))
-        if _ASC_END not in file.read().lower():
-            raise _Truncated("'End TriggerBlock' is missing")
-    with ASCReader(path) as reader:
-        for message in reader:
-            if reader.timestamps_format == "relative":
-                raise ValueError("only absolute time stamps are read")
-            if message.is_fd and message.is_remote_frame:  # how the reader takes a frame without data
-                message.is_remote_frame, message.dlc = False, 0
-            elif not message.is_fd and message.dlc > 8:  # the reader takes the code for one of flexible data rate
-                message.dlc = len2dlc(message.dlc)
-            yield round(message.timestamp * 1e9), message
+def _check(time_ns: int, message: can.Message, count: int) -> None:
+    """Damage: a frame is none that a bus can have, or its time none of some centuries. count: frames before."""
+    length = len(message.data)
+    longest = 64 if message.is_fd else 8
+    if message.arbitration_id > (0x1FFFFFFF if message.is_extended_id or message.is_error_frame else 0x7FF):
+        raise Damage(f"after frame {count}: identifier {message.arbitration_id:X} is too large")
+    if length > longest or not 0 <= message.dlc <= (64 if message.is_fd else 15):
+        raise Damage(f"after frame {count}: a frame of length {message.dlc} with {length} data bytes")
+    if abs(time_ns) > _TIME_MAX_NS:
+        raise Damage(f"after frame {count}: a time of {time_ns * 1e-9:.6g} s")
 
 
-def _read_candump(path: Path) -> Iterator[tuple[int, can.Message]]:
-    with path.open(encoding="ascii", newline="\n") as file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith("\n"):
-                raise _Truncated(f"line {number} has no end")
-            match = _CANDUMP.fullmatch(line)
-            if match is None:
-                raise ValueError(f"line {number}: {line.strip()[:60]!r} is no frame as candump -L writes it")
-            yield int(match["s"]) * 10**9 + int(match["fraction"].ljust(9, "0")), _candump_message(match)
-
-
-def _candump_message(match: re.Match[str]) -> can.Message:
-    identifier = int(match["identifier"], 16)
-    wide = len(match["identifier"]) > 3
-    flags = int(match["flags"] or "0", 16)
-    data = bytes.fromhex(match["data"] or match["flexible"] or "")
-    length = int(match["raw_length"] or match["remote"] or "0", 16) or len(data)
-    return can.Message(
-        timestamp=0.0, arbitration_id=identifier & 0x1FFFFFFF,
-        is_error_frame=wide and bool(identifier & _ERROR_FLAG), is_extended_id=wide and not identifier & _ERROR_FLAG,
-        is_remote_frame=match["remote"] is not None, is_fd=match["flags"] is not None,
-        bitrate_switch=bool(flags & 1), error_state_indicator=bool(flags & 2), dlc=length, data=data)
+def _read_database(path: Path) -> Frames:
+    """The frames of an SQLite file that python-can has written; it has no flexible data rate, and times as floats."""
+    connection = sqlite3.connect(f"file:{path.resolve().as_posix().replace('?', '%3f').replace('#', '%23')}?mode=ro",
+                                 uri=True)
+    count = 0
+    try:
+        cursor = connection.execute("SELECT ts, arbitration_id, extended, remote, error, dlc, data FROM messages")
+        for time_s, identifier, extended, remote, error, dlc, data in cursor:
+            count += 1
+            yield nanoseconds(repr(float(time_s))), can.Message(
+                arbitration_id=int(identifier), is_extended_id=bool(extended), is_remote_frame=bool(remote),
+                is_error_frame=bool(error), dlc=int(dlc), data=b"" if remote else bytes(data or b""))
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+        raise Damage(f"after row {count}: {error}") from None
+    finally:
+        connection.close()

@@ -18,13 +18,19 @@ import numpy as np
 from cantools.database.can import Database
 
 from salient.bus.identity import Carrier, OtherDatabase, hash_of
+from salient.bus.log import FileLog
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import UsageError
 
 _DEFLATE = 1
+_S_NS = 1_000_000_000
+_DAY_NS = 86_400 * _S_NS
+_DATED_NS = 365 * _DAY_NS
+"""Earlier times are those since the start of a drive."""
+_FRAME_BYTES = 16
 
 
-class Mf4Log:
+class Mf4Log(FileLog):
     """An MF4 file, written when it is closed; until then 16 bytes of memory for each frame. Its comment names the
     machine.
 
@@ -35,20 +41,22 @@ class Mf4Log:
     frames.
     """
 
-    def __init__(self, path: Path, machine: str | None, node: int, source: str) -> None:
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+        super().__init__(path)
         try:
             import asammdf
         except ImportError:
-            raise UsageError(f"--out {path}: MF4 requires the Python package asammdf") from None
+            raise UsageError(f"--out {path}: MF4 requires the Python package asammdf "
+                             "(pip install 'salient-drive[mf4]')") from None
         self._mdf: Any = asammdf.MDF(version="4.10")
-        self._mdf.start_time = datetime.fromtimestamp(0, UTC)  # virtual time has no date
         self._signal = asammdf.Signal
-        self._carrier, self._node = Carrier(source, machine, node), node
+        self._carrier, self._node = carrier, node
         self._frames = tuple(SignalTable(database) for database in self._databases(None))
-        self._path, self._source = path, source
+        self._source = source
+        self._start_ns: int | None = None
         path.open("wb").close()  # a path that cannot be written is reported before hours of recording
 
-    _refused = False
+    _refused = _closed = False
 
     def _databases(self, machine: str | None) -> tuple[Database, Database]:
         return drive_database(machine, self._node), rig_database(self._node)
@@ -58,24 +66,34 @@ class Mf4Log:
             self._carrier.take(message)
         except OtherDatabase:
             if self._carrier.machine is None:
-                self._path.unlink(missing_ok=True)
+                self.path.unlink(missing_ok=True)
                 self._refused = True
             raise
+        if self._start_ns is None:  # virtual time has no date; as floats, times since 1970 lose 256 ns
+            self._start_ns = time_ns // _DAY_NS * _DAY_NS if time_ns >= _DATED_NS else 0
         for table in self._frames:
-            table.add(time_ns, message)
+            table.add(time_ns - self._start_ns, message)
+
+    @property
+    def size(self) -> int:
+        return _FRAME_BYTES * sum(map(SignalTable.frames, self._frames))
 
     def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
         if self._refused:
             self._mdf.close()
             return
+        self._mdf.header.start_time = datetime.fromtimestamp((self._start_ns or 0) // _S_NS, UTC)
         machine = self._carrier.likely
         if self._carrier.machine is None and len(self._frames[0]["DRIVE_STATUS.state"]):
-            print(f"salient: {self._source}: no DRIVE_IDENTITY: {self._path} has the signals of {machine}; "
+            print(f"salient: {self._source}: no DRIVE_IDENTITY: {self.path} has the signals of {machine}; "
                   "--machine states another", file=sys.stderr)
         self._mdf.header.comment = f"machine {machine}, DBC {hash_of(machine):08x}"
         for name, comment, channels in self._groups(machine):
             self._mdf.append(channels, acq_name=name, comment=comment, common_timebase=True)
-        self._mdf.save(self._path, overwrite=True, compression=_DEFLATE)
+        self._mdf.save(self.path, overwrite=True, compression=_DEFLATE)
         self._mdf.close()
 
     def _groups(self, machine: str) -> Iterator[tuple[str, str, list[Any]]]:

@@ -14,9 +14,11 @@ from cantools.database.can import Database
 from salient.bus.clock import VirtualTimeReader, has_plain_data, nodes_of_drives, open_bus
 from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
 from salient.bus.interface import closed_in_order
-from salient.bus.log import open_log
+from salient.bus.log import DECODED_SUFFIXES, open_log
+from salient.bus.log_reader import read_log
 from salient.bus.selected_signals import SelectedSignals
 from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.config import Rotation
 from salient.errors import UsageError
 
 _COLUMNS = (
@@ -41,9 +43,10 @@ class _BusClosed(Exception):
     """The bus ended while this command was listening; the text is the reason of python-can."""
 
 
-def record(address: str, path: Path, duration_s: float | None, machine: str | None, node: int = 0) -> int:
+def record(address: str, path: Path, duration_s: float | None, machine: str | None, node: int = 0,
+           rotation: Rotation | None = None) -> int:
     """Writes every frame on a bus to a log file, on virtual time. machine, node: of the drive whose signals an MF4 file
-    has, by default the machine that it reports.
+    has, by default the machine that it reports. rotation: see RotatingLog.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
     every case. Returns the exit code: 1 when the bus closed early (see _report_closed) or an MF4 file has no frame of
@@ -54,9 +57,10 @@ def record(address: str, path: Path, duration_s: float | None, machine: str | No
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path, machine, node, address)
+    log = open_log(path, machine, node, address, rotation)
     count, closed = 0, None
-    nodes = _Nodes(address, node if path.suffix == ".mf4" else None)  # the other formats have the frames of all
+    # The formats with frames have those of all nodes.
+    nodes = _Nodes(address, node if path.suffix in DECODED_SUFFIXES else None)
     try:
         for timed in nodes.watch(_frames(address, duration_s, "recording", nodes.tell_absence)):
             log.write(*timed)
@@ -67,22 +71,24 @@ def record(address: str, path: Path, duration_s: float | None, machine: str | No
         closed = str(end)
     finally:
         log.close()
-    print(f"{count} frames: {path}", flush=True)
+    print(f"{count} frames: {log.place}", flush=True)
     return _finish(address, duration_s, closed, nodes)
 
 
 def monitor(address: str, every_s: float, duration_s: float | None, machine: str | None,
-            signals: Sequence[str] | None = None, node: int = 0) -> int:
+            signals: Sequence[str] | None = None, node: int = 0, replay: Path | None = None) -> int:
     """Prints the named signals, else the main ones of the drive of a machine and node number, every `every_s` of
     virtual time; ends as `record` does, with its exit code, which is 1 as well when no frame of the drive has come.
-    Without a machine it is that which the drive reports. UsageError: no such machine, or no signal of a name;
-    OtherDatabase: see Carrier."""
+    Without a machine it is that which the drive reports. replay: a log, instead of a bus; LogDamaged, after the lines
+    of what can be read. UsageError: no such machine, or no signal of a name; OtherDatabase: see Carrier."""
+    address = address if replay is None else str(replay)
     carrier = Carrier(address, machine, node)
     shown = _shown(None, node, signals)  # for the names
     due_ns, closed = None, None
     heard = True
     nodes = _Nodes(address, node)
-    frames = nodes.watch(_frames(address, duration_s, "monitoring", nodes.tell_absence))
+    frames = nodes.watch(_frames(address, duration_s, "monitoring", nodes.tell_absence) if replay is None
+                         else _logged(replay, duration_s))
     try:
         for time_ns, message, begins in identified(frames, carrier):
             if begins:
@@ -215,6 +221,16 @@ def _frames(address: str, duration_s: float | None, activity: str, tell_silence:
             if end_ns is not None and timed[0] > end_ns:
                 return
             yield timed
+
+
+def _logged(path: Path, duration_s: float | None) -> Iterator[tuple[int, can.Message]]:
+    """The frames of a log, until `duration_s` have passed in it; LogDamaged is raised after the rest was shown."""
+    begin_ns = None
+    for time_ns, message in read_log(path, "--replay"):
+        begin_ns = time_ns if begin_ns is None else begin_ns
+        if duration_s is not None and time_ns - begin_ns > duration_s * 1e9:
+            return
+        yield time_ns, message
 
 
 def _report_closed(address: str, duration_s: float | None, reason: str) -> int:

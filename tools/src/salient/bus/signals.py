@@ -152,14 +152,28 @@ class SignalTable(Mapping[str, Signal]):
     def __getitem__(self, name: str) -> Signal:
         if name not in self._names:
             raise KeyError(f"no signal '{name}'; {near_signals(name, self._names)}")
+        raw, time_ns = self._columns(name)
+        signal = self._names[name][1]
+        choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
+        return Signal(signal.name, signal.unit or "", time_ns / 1e9, _physical(raw, signal), choices or None)
+
+    def _columns(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Data as words of 64 bits and times of the frames that carry a signal."""
         key, signal = self._names[name]
         raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
         time_ns = np.array(self._times[key], dtype=np.int64)
         if signal.multiplexer_ids:
             carries = _raw(raw, _multiplexer(self._messages[key])) == signal.multiplexer_ids[0]
             raw, time_ns = raw[carries], time_ns[carries]
-        choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
-        return Signal(signal.name, signal.unit or "", time_ns / 1e9, _physical(raw, signal), choices or None)
+        return raw, time_ns
+
+    def times_ns(self, name: str) -> np.ndarray:
+        """Times of a signal without the rounding to the floats of `Signal`."""
+        return self._columns(name)[1]
+
+    def frames(self) -> int:
+        """Number of frames of all messages."""
+        return sum(map(len, self._times.values()))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

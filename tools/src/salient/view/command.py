@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import signal
+import sys
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import can
 from salient.bench.stimulus import STIMULI, Stimulus, act_frames, stimuli
 from salient.bus.clock import VirtualTimeReader, open_bus
 from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
-from salient.bus.log_reader import read_log
+from salient.bus.log_reader import KnownFrames, LogDamaged, NoKnownFrame, read_log
 from salient.errors import UsageError
 from salient.version import VERSION
 from salient.view.commands import COMMANDS
@@ -53,14 +55,17 @@ class LogFeed:
     link = None
 
     def __init__(self, path: Path, carrier: Carrier, node: int, acts: list[Stimulus] | None = None) -> None:
-        """acts: what was done; without it what the log has of that. OtherDatabase: see Carrier."""
+        """acts: what was done; without it what the log has of that. OtherDatabase: see Carrier.
+        NoKnownFrame."""
         self.store = FrameStore(kept=1 << 62)
         chunk = Chunk()
         first_ns, last_ns = None, 0
         of_hosts: list[tuple[int, can.Message]] = []
         relevant = act_frames(None, (node,)) if acts is None else {}
-        for time_ns, message in read_log(path, "--replay"):
+        known = KnownFrames(node)
+        for time_ns, message in self._frames(path):
             carrier.take(message)
+            known.add(message)
             if (message.arbitration_id, message.is_extended_id) in relevant:
                 of_hosts.append((time_ns, message))
             if chunk.add(time_ns, message):
@@ -71,7 +76,8 @@ class LogFeed:
         if len(chunk):
             self.store.put(chunk)
         if first_ns is None:
-            raise UsageError(f"--replay {path}: the log has no data frame")
+            raise NoKnownFrame(self.damage or f"--replay {path}: the log has no data frame")
+        known.require(self.damage or f"--replay {path}")
         machine = carrier.likely
         if acts is None:
             acts = stimuli(of_hosts, last_ns, machine, (node,))
@@ -80,13 +86,23 @@ class LogFeed:
                      "build": f"salient {VERSION}", "period_ms": 0, "start_ns": first_ns, "end_ns": last_ns,
                      "stimuli": [asdict(stimulus) for stimulus in acts]}
 
+    damage = ""
+    """Where the log could not be read, and how many frames are before that."""
+
+    def _frames(self, path: Path) -> Iterator[tuple[int, can.Message]]:
+        try:
+            yield from read_log(path, "--replay")
+        except LogDamaged as error:
+            self.damage = str(error)
+
     def first_number(self) -> int:
         return 0
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serves the page until an interrupt; prints its link."""
+    """Serves the page until an interrupt; prints its link. Returns 1 when a log was read up to its damage."""
     feed: Feed
+    damage = ""
     if options.replay is None:
         carrier = Carrier(options.can, options.machine, options.node or 0)
         _listen(options.can, carrier)
@@ -96,6 +112,9 @@ def run(options: argparse.Namespace) -> int:
         node = notes.get("node", 0) if options.node is None else options.node
         carrier = Carrier(str(path), options.machine, node, noted=notes.get("machine"))
         feed = LogFeed(path, carrier, node, _acts_of(notes))
+        damage = feed.damage
+        if damage:
+            print(f"salient: {damage}", file=sys.stderr, flush=True)
     server = Server(feed)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     print(f"live page: {server.link}", flush=True)
@@ -104,7 +123,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         if feed.link is not None:
             feed.link.close()
-    return 0
+    return 1 if damage else 0
 
 
 def _listen(address: str, carrier: Carrier) -> None:

@@ -1,0 +1,158 @@
+"""Decoded signals as a table of one row for each value: CSV, and Parquet for what reads columns."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import can
+
+from salient.bus.identity import Carrier, OtherDatabase
+from salient.bus.log import FileLog
+from salient.bus.signals import Signal, SignalTable, drive_database, rig_database
+from salient.errors import UsageError
+
+_BATCH_FRAMES = 20_000
+_HELD_MAX = 1_000_000
+"""Frames, of 16 bytes each, that wait until the drive says which machine it carries; it does each 100 ms."""
+_COLUMNS = ("time_s", "message", "signal", "value", "unit", "name")
+
+Row = tuple[int, str, str, float, str, str]
+"""Time in ns, message, signal, value, unit, and the name of the value where it has one."""
+
+
+class TableLog(FileLog):
+    """A table of signals, in the order of time within each 20,000 frames. The frames that the DBCs of drive and test
+    bench do not define are left out, as in MF4. write raises OtherDatabase, as Carrier does."""
+
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+        super().__init__(path)
+        self._carrier, self._node, self._source = carrier, node, source
+        self._tables = self._new_tables()
+        self._finished = 0
+        self._closed = False
+
+    def _new_tables(self) -> tuple[SignalTable, SignalTable]:
+        return SignalTable(drive_database(None, self._node)), SignalTable(rig_database(self._node))
+
+    def write(self, time_ns: int, message: can.Message) -> None:
+        """Takes a frame."""
+        try:
+            known = self._carrier.take(message)
+        except OtherDatabase:
+            if self._carrier.machine is None:
+                self.discard()
+            raise
+        for table in self._tables:
+            table.add(time_ns, message)
+        if (waiting := sum(map(SignalTable.frames, self._tables))) >= (_BATCH_FRAMES if known else _HELD_MAX):
+            self._put()
+            self._finished += waiting
+
+    def _put(self) -> None:
+        """Writes the rows of the frames that wait."""
+        self._tables[0].decode_with(drive_database(self._carrier.likely, self._node))
+        self.put_rows(sorted(self._rows(), key=lambda row: row[0]))
+        self._tables = self._new_tables()
+
+    def _rows(self) -> Iterator[Row]:
+        for table in self._tables:
+            for full_name in table:
+                message, dot, name = full_name.partition(".")
+                if not dot or not len(signal := table[full_name]):
+                    continue
+                for time_ns, value, text in zip(table.times_ns(full_name).tolist(), signal.value.tolist(),
+                                                _names(signal), strict=True):
+                    yield time_ns, message, name, value, signal.unit, text
+
+    def put_rows(self, rows: list[Row]) -> None:
+        """Appends rows."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Completes the file."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        if self._carrier.machine is None and len(self._tables[0]["DRIVE_STATUS.state"]):
+            print(f"salient: {self._source}: no DRIVE_IDENTITY: {self.path} has the signals of {self._carrier.likely}; "
+                  "--machine states another", file=sys.stderr)
+        self._put()
+        self.finish()
+
+    @property
+    def size(self) -> int:
+        return 16 * (self._finished + sum(map(SignalTable.frames, self._tables)))
+
+
+def _names(signal: Signal) -> list[str]:
+    if not signal.choices:
+        return [""] * len(signal)
+    return [signal.choices.get(int(value), "") for value in signal.value.tolist()]
+
+
+class CsvLog(TableLog):
+    """CSV with the columns time_s, message, signal, value, unit and name."""
+
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+        super().__init__(path, carrier, node, source)
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._write(",".join(_COLUMNS) + "\n")
+
+    _bytes = 0
+
+    def _write(self, text: str) -> None:
+        self._bytes += self._file.write(text)
+
+    def put_rows(self, rows: list[Row]) -> None:
+        text = StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerows((_seconds(time_ns), message, signal, f"{value:.10g}", unit, name)
+                        for time_ns, message, signal, value, unit, name in rows)
+        self._write(text.getvalue())
+
+    @property
+    def size(self) -> int:
+        return self._bytes
+
+    def finish(self) -> None:
+        self._file.close()
+
+
+def _seconds(time_ns: int) -> str:
+    seconds, nanoseconds = divmod(abs(time_ns), 1_000_000_000)
+    return f"{'-' if time_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
+
+
+class ParquetLog(TableLog):
+    """Parquet with the columns time_ns (whole), message, signal, value, unit and name."""
+
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+        super().__init__(path, carrier, node, source)
+        try:
+            import pyarrow
+            import pyarrow.parquet
+        except ImportError:
+            raise UsageError(f"--out {path}: Parquet requires the Python package pyarrow "
+                             "(pip install 'salient-drive[parquet]')") from None
+        self._arrow: Any = pyarrow
+        types = (pyarrow.int64(), pyarrow.string(), pyarrow.string(), pyarrow.float64(), pyarrow.string(),
+                 pyarrow.string())
+        names = ("time_ns", *_COLUMNS[1:])
+        self._schema: Any = pyarrow.schema(list(zip(names, types, strict=True)))
+        self._writer: Any = pyarrow.parquet.ParquetWriter(path, self._schema)
+
+    def put_rows(self, rows: list[Row]) -> None:
+        if rows:
+            columns = [list(column) for column in zip(*rows, strict=True)]
+            self._writer.write_table(self._arrow.table(columns, schema=self._schema))
+
+    def finish(self) -> None:
+        self._writer.close()
