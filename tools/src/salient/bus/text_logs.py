@@ -402,6 +402,8 @@ _PYTHON_CAN_COLUMNS = {"timestamp", "arbitration_id", "extended", "remote", "err
 
 def _savvy(row: dict[str, str], is_ended: bool) -> tuple[int, can.Message]:
     length = int(row["len"])
+    if not 0 <= length <= 64:
+        raise ValueError("length")
     data = _hex_bytes([row.get(f"d{number}") or "" for number in range(1, length + 1)], length)
     is_fd = length > 8
     return nanoseconds(row["time stamp"], 1_000_000), can.Message(
