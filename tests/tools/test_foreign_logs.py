@@ -47,7 +47,7 @@ S = 1_000_000_000
         ("A.LOG", "\ufeff(1.0) can0 123#\n", [(S, 0x123, b"")]),
         ("a.asc", ASC_HEADER.format("dec", "absolute") + " 0.5 1  385 Rx   d 2 16 255\n",
          [(S // 2, 385, b"\x10\xff")]),
-        ("a.asc", ASC_HEADER.format("hex", "relative") + " 0.5 1 11 Rx d 0\n 0.25 1 Statistic: D 1\n 0.25 1 12 Rx d 0\n",
+        ("a.asc", ASC_HEADER.format("hex", "relative") + " 0.5 1 11 Rx d 0\n 0.25 1 Statistic: D\n 0.25 1 12 Rx d 0\n",
          [(S // 2, 0x11, b""), (S, 0x12, b"")]),
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " -0.25 1 11 Rx d 0\n 0.0 Start der Messung\n",
          [(-S // 4, 0x11, b"")]),
@@ -78,7 +78,8 @@ def test_text_of_other_tools_is_read_with_all_frames(tmp_path, name, text, frame
          1, "after line 5"),
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " 0.5 1 11 Rx d 1 05\n 0.6 1 11 Rx d 2 05\n", 1, "line 5"),
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " 0.5 1 11 Rx d 1 05\n 0.6 1 Engine Rx d 0\n", 1, "line 5"),
-        ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n1,1,false,Rx,0,1,05\n2,1,false,Rx,0,80000000,05\n", 1, "line 3"),
+        ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n1,1,false,Rx,0,1,05\n2,1,false,Rx,0,80000000,05\n",
+         1, "line 3"),
         ("a.trc", ";$FILEVERSION=1.1\n 1) 1.5 Rx 0123 1 01\n 2) 1.6 Rx 0123 2 01\n", 1, "line 3"),
     ],
 )
