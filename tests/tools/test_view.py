@@ -553,7 +553,7 @@ def test_flux_linkage_of_the_page_is_that_of_the_machine():
 @pytest.mark.parametrize(("options", "text"), [
     (["--replay", "nothing.blf"], "--replay nothing.blf: No such file or directory"),
     (["--replay", "."], "--replay .: a folder must have can.blf, as that of a failed test has"),
-    (["--replay", "x.mf4"], "--replay x.mf4: the suffix must be .asc, .blf or .log (MF4 has signals, no frames)"),
+    (["--replay", "x.pcap"], "--replay x.pcap: the suffix must be .asc, .blf, .csv, .db, .log, .mf4, .trc or .txt"),
     (["--can", "unix:nowhere"], "unix:nowhere: no drive answers there (No such file or directory)"),
     (["--can", "unix:nowhere", "--machine", "nothing"], "machine 'nothing': no such file"),
 ])

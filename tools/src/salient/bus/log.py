@@ -7,12 +7,12 @@ import struct
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Protocol
 
 import can
 from can.io import ASCWriter, BLFWriter, blf
 from can.util import len2dlc
 
+from salient.bus.file_log import FileLog, Log
 from salient.bus.identity import Carrier
 from salient.config import LOG_SUFFIXES, Rotation, either
 from salient.errors import RunFailed, UsageError
@@ -25,46 +25,6 @@ _BLF_START_OFFSET = 40
 """Of the start in the header of a file."""
 _NUMBER_DIGITS = 4  # of a file of a rotated log
 DECODED_SUFFIXES = (".mf4", ".csv", ".parquet")
-
-
-class Log(Protocol):
-    """A log that is being written."""
-
-    def write(self, time_ns: int, message: can.Message) -> None:
-        """Appends a frame."""
-
-    def close(self) -> None:
-        """Completes the file."""
-
-    def discard(self) -> None:
-        """Completes and removes what was written."""
-
-    @property
-    def size(self) -> int:
-        """Bytes until now; of a format that is compressed later, those before it is."""
-
-    @property
-    def place(self) -> str:
-        """The file, or the first and the last of several."""
-
-
-class FileLog:
-    """A log in one file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    @property
-    def place(self) -> str:
-        return str(self.path)
-
-    def close(self) -> None:
-        raise NotImplementedError
-
-    def discard(self) -> None:
-        """Completes and removes the file."""
-        self.close()
-        self.path.unlink(missing_ok=True)
 
 
 class _BlfWriter(BLFWriter):

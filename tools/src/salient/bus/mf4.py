@@ -17,8 +17,8 @@ import can
 import numpy as np
 from cantools.database.can import Database
 
+from salient.bus.file_log import FileLog
 from salient.bus.identity import Carrier, OtherDatabase, hash_of
-from salient.bus.log import FileLog
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import UsageError
 

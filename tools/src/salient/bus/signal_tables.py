@@ -11,8 +11,8 @@ from typing import Any
 
 import can
 
+from salient.bus.file_log import FileLog
 from salient.bus.identity import Carrier, OtherDatabase
-from salient.bus.log import FileLog
 from salient.bus.signals import Signal, SignalTable, drive_database, rig_database
 from salient.errors import UsageError
 
