@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import queue
 import socket
 import subprocess
 import sys
+import threading
 import time
+from types import SimpleNamespace
 
 import can
 import pytest
 
+from salient.bus import interface
 from salient.bus.interface import SalientBus, frame_bytes, message_of
 
 TIMEOUT_S = 10.0
@@ -132,30 +136,51 @@ class CountingListener(can.Listener):
 
 
 @pytest.mark.parametrize("cause", ["drive", "client"])
-def test_listener_that_handles_the_end_is_not_called_without_pause(connect, cause):
-    """One call, and one more per timeout of the Notifier: 1 s."""
+def test_listener_that_handles_the_end_is_not_called_without_pause(connect, monkeypatch, cause):
+    """One call, and one more per timeout of the Notifier: 1 s. The test holds each pause until it has looked."""
     bus, listener = connect(), CountingListener()
-    with can.Notifier(bus, [listener]):
+    pauses, go_on = queue.Queue(), threading.Semaphore(0)
+
+    def pause(duration_s: float) -> None:
+        pauses.put((duration_s, len(listener.errors)))
+        go_on.acquire()
+
+    monkeypatch.setattr(interface, "time", SimpleNamespace(sleep=pause, monotonic=time.monotonic))
+    with can.Notifier(bus, [listener]) as notifier:
         if cause == "drive":
             connect.bench.simulator.close()
         else:
             bus.shutdown()
-        time.sleep(1.5)
-    assert 1 <= len(listener.errors) <= 3
+        seen = []
+        for _ in range(3):
+            seen.append(pauses.get(timeout=TIMEOUT_S))
+            go_on.release()
+        go_on.release(1000)
+        notifier.stop()
+    before = {"drive": 1, "client": 0}[cause]  # calls ahead of the first pause
+    assert seen == [(1.0, before), (1.0, before + 1), (1.0, before + 2)]
     reason = {"drive": "the drive has ended", "client": "this client was shut down"}[cause]
     assert all(str(error).endswith(reason) for error in listener.errors)
 
 
 def test_event_loop_reports_the_end_once(connect):
+    """A descriptor that stays ready would be called back in each of the turns that the loop makes after the report."""
     bus = connect()
     reported = []
 
     async def wait_for_the_end() -> None:
-        loop = asyncio.get_running_loop()
-        loop.set_exception_handler(lambda _, context: reported.append(context["exception"]))
+        loop, has_ended = asyncio.get_running_loop(), asyncio.Event()
+
+        def report(_: asyncio.AbstractEventLoop, context: dict) -> None:
+            reported.append(context["exception"])
+            has_ended.set()
+
+        loop.set_exception_handler(report)
         with can.Notifier(bus, [can.AsyncBufferedReader()], loop=loop):
             connect.bench.simulator.close()
-            await asyncio.sleep(0.5)
+            await asyncio.wait_for(has_ended.wait(), TIMEOUT_S)
+            for _ in range(100):
+                await asyncio.sleep(0)  # a turn of the loop
 
     asyncio.run(wait_for_the_end())
     assert [str(error).endswith("can0.sock: the drive has ended") for error in reported] == [True]
