@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +17,7 @@ from salient.__main__ import main
 from salient.builder import build_preset
 from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.errors import UsageError
+from salient.guard import guarded
 from salient.paths import BUILD, ROOT, build_lock, from_root
 from salient.turns import TURNS, turn_of_name
 
@@ -62,6 +66,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Brings the builds up to date that the selected folders run; ends the session when one fails. With a drive that
     runs already, or in the VM, nothing is built."""
     config = session.config
+    # Processes and temporary files of a test end with pytest, whatever ends it. The folders of tmp_path stay where
+    # pytest has them, and as long.
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+    run = ExitStack()
+    run.enter_context(guarded())
+    config.add_cleanup(run.close)
     if hasattr(config, "workerinput") or config.option.collectonly or config.getoption("--salient-can") != "local":
         return
     selected = [Path(argument.partition("::")[0]).absolute() for argument in config.args]

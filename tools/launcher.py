@@ -24,6 +24,7 @@ sys.path.insert(0, str(TOOLS / "src"))
 from salient.builder import build_preset  # noqa: E402  (needs the path above)
 from salient.cli import make_parser  # noqa: E402
 from salient.errors import exit_code  # noqa: E402
+from salient.guard import RUNS  # noqa: E402
 from salient.paths import BUILD, ROOT, build_lock, from_root  # noqa: E402
 
 VENV = BUILD / "venv"
@@ -158,7 +159,8 @@ def _sudo_works() -> bool:
 
 def _as_root(command: list[str], output: BinaryIO) -> bool:
     prefix = [] if os.geteuid() == 0 else ["sudo", "-n"]
-    command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", *command]
+    # Packages that are installed in part would be a mess: what has begun goes on when this command is killed.
+    command = [*prefix, "env", "-u", RUNS, "-u", "TMPDIR", "DEBIAN_FRONTEND=noninteractive", *command]
     return subprocess.run(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output).returncode == 0
 
 

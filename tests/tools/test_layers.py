@@ -30,8 +30,9 @@ JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memo
                                "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
-    "salient", "salient.errors", "salient.paths", "salient.workers", "salient.progress", "salient.config",
-    "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.c_limits", "salient.turns",
+    "salient", "salient.guard", "salient.errors", "salient.paths", "salient.workers", "salient.progress",
+    "salient.config", "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.c_limits",
+    "salient.turns",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",

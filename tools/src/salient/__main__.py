@@ -10,6 +10,7 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import RunFailed, UsageError, exit_code
+from salient.guard import removes
 from salient.light_can import without_mf4
 from salient.paths import BUILD, OUT, make_folder, scenario_path
 
@@ -73,7 +74,10 @@ def _sim(options: argparse.Namespace) -> int:
     from salient.machine.cache import bench_config
 
     given = {name: value for name, value in vars(options).items() if name in OPTIONS and value is not None}
-    command = command_line(bench_config(given))
+    config = bench_config(given)
+    command = command_line(config)
+    if config.can.startswith("unix:"):
+        removes(Path(config.can.removeprefix("unix:")))
     os.execv(command[0], command)
 
 

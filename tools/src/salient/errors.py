@@ -8,6 +8,8 @@ import select
 import sys
 from collections.abc import Callable, Iterable
 
+from salient.guard import guarded
+
 
 class UsageError(Exception):
     """A mistake of the caller; the text is one line that names the mistake and the values allowed. Exit code 2."""
@@ -58,17 +60,19 @@ def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: No
     """Runs a command; returns its exit code, and after one line for what it raises 1 (RunFailed, a connection), 2
     (UsageError, files and folders) or 130 (Ctrl-C). A reader of the output that has enough, as head, is no failure.
 
-    This is the only place that ends a command for what lies outside it. out: the value of --out, which stands for the
+    This is the only place that ends a command for what lies outside it; what the command has started and its temporary
+    files end with it (salient.guard). out: the value of --out, which stands for the
     file of a write that failed.
     """
     try:
-        try:
-            code = command()
-        except SystemExit as end:  # of the command line
-            code = end.code if isinstance(end.code, int) else 0
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        return code
+        with guarded():
+            try:
+                code = command()
+            except SystemExit as end:  # of the command line
+                code = end.code if isinstance(end.code, int) else 0
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            return code
     except UsageError as error:
         return _end(str(error), 2)
     except RunFailed as error:

@@ -202,7 +202,8 @@ def _frames(address: str, duration_s: float | None, activity: str, tell_silence:
     end_ns = None
     timeout_s = None if address.startswith("unix:") else _ABSENT_S
     # A termination request ends the command like an interrupt, so that its output is complete.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for request in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(request, signal.default_int_handler)
     with open_bus(address) as bus:
         reader = VirtualTimeReader(bus)
         print(f"{activity} {address}", flush=True)

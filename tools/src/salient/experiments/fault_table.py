@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from salient.config import CONTROLLERS
+from salient.errors import exit_code
 from salient.experiments.campaign import branching
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import FaultStep, LoadStep, Record, Scenario, SpeedStep, run_scenario
@@ -246,4 +247,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

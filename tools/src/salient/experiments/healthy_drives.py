@@ -18,6 +18,7 @@ import os
 import subprocess
 import sys
 
+from salient.errors import exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.machines import pool_line
 from salient.experiments.campaign.runner import Result, program
@@ -82,4 +83,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main))

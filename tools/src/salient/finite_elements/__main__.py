@@ -2,6 +2,7 @@
 
 import sys
 
+from salient.errors import exit_code
 from salient.finite_elements.map import main
 
-sys.exit(main(sys.argv[1:]))
+sys.exit(exit_code(lambda: main(sys.argv[1:])))

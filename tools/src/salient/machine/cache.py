@@ -18,6 +18,7 @@ from typing import Any
 
 from salient.config import DEFAULTS, BenchConfig
 from salient.errors import UsageError, close_names
+from salient.guard import removes
 from salient.machine.path import MachineError, machine_path, stated_conditions
 from salient.paths import BUILD, DRIVE_DBC, EXAMPLE_MACHINES, IS_WHEEL, MACHINES, PARAMETERS, PYTHON_PACKAGES
 
@@ -146,6 +147,7 @@ def _generator() -> bytes:
 def _write(path: Path, content: bytes) -> None:
     """Another process sees the whole file or none."""
     temporary = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
+    removes(temporary)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -16,6 +16,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from salient.guard import removes
+
 KERNEL_PACKAGE = "linux-image-amd64"  # the smaller cloud kernel has neither CAN nor 9p
 BUSYBOX_PACKAGE = "busybox-static"
 MODULES = ("virtio_pci", "virtio_console", "9pnet_virtio", "9p", "vcan", "can-raw", "can-bcm", "can-isotp")
@@ -46,6 +48,7 @@ def prepare(folder: Path) -> VmFiles:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="unpack-", dir=folder.parent) as name:
         scratch = Path(name)
+        removes(scratch)
         print(
             f"salient vm: downloading {KERNEL_PACKAGE} and {BUSYBOX_PACKAGE} (about 70 MB, once, into {folder}): "
             "this host has no usable vcan0, a VM with Debian's kernel has",

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from salient.errors import UsageError
+from salient.guard import guarded
 from salient.paths import BUILD, ROOT
 from salient.vm import kernel
 from salient.vm.initramfs import Cpio
@@ -91,7 +92,7 @@ def run_in_vm(
     working_folder = Path.cwd()
     if not _is_visible(working_folder, [path for path, _ in shares]):
         raise UsageError(f"{working_folder} is not visible in the VM: call from the repository or another folder")
-    with tempfile.TemporaryDirectory(prefix="run-", dir=VM_FOLDER) as name:
+    with tempfile.TemporaryDirectory(prefix="salient-") as name:
         scratch = Path(name)
         (scratch / "initramfs").write_bytes(_initramfs(files, shares, command, working_folder))
         exit_code = _run_qemu(files.kernel, shares, scratch, timeout_s)
@@ -163,7 +164,6 @@ def _tag(number: int) -> str:
 def _run_qemu(kernel: Path, shares: list[tuple[Path, str]], scratch: Path, timeout_s: float) -> int | None:
     """The command's exit code, or None when QEMU ended before it was known."""
     arguments = [
-        "setpriv", "--pdeathsig", "KILL",  # a VM must not outlive this process
         QEMU, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none",
         # Measured: importing numpy, python-can and cantools takes 7 s; with two processors and mitigations, 13 s.
         "-machine", "pc", "-accel", "tcg", "-cpu", "max", "-smp", "1", "-m", "2G",
@@ -243,7 +243,6 @@ def main() -> int:
         except OSError as error:
             print(f"salient vm: {options.command[0]}: {error.strerror}", file=sys.stderr)
             return 127
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that QEMU is ended, too
     try:
         return run_in_vm(
             options.command, write=options.write, timeout_s=options.timeout_s, install=not options.no_install
@@ -256,4 +255,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with guarded():
+        sys.exit(main())
