@@ -75,10 +75,13 @@ def begin() -> bool:
             pidfd = os.pidfd_open(os.getpid())
         except (AttributeError, OSError):
             return False
+        folder = None
         try:
             folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-")).absolute()
             _start(pidfd, folder)
-        except OSError:
+        except (OSError, NotImplementedError):
+            if folder:
+                folder.rmdir()
             return False
         finally:
             os.close(pidfd)
@@ -120,8 +123,8 @@ def _end() -> None:
 
 def main(pid: int, folder: Path) -> None:
     """Waits for the end of the process of descriptor _PIDFD, and ends the run of that folder."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
+    for request in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(request, signal.SIG_IGN)
     for number in [int(path.name) for path in Path("/proc/self/fd").iterdir()]:
         if number > _PIDFD:
             with suppress(OSError):

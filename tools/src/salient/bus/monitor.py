@@ -201,9 +201,11 @@ def _frames(address: str, duration_s: float | None, activity: str, tell_silence:
     tell_silence is called where an interface has been silent for _ABSENT_S; the time of a local bus may stand still."""
     end_ns = None
     timeout_s = None if address.startswith("unix:") else _ABSENT_S
-    # A termination request ends the command like an interrupt, so that its output is complete.
+    # A termination request ends the command like an interrupt, so that its output is complete; not one that nohup has
+    # set to be ignored.
     for request in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(request, signal.default_int_handler)
+        if signal.getsignal(request) != signal.SIG_IGN:
+            signal.signal(request, signal.default_int_handler)
     with open_bus(address) as bus:
         reader = VirtualTimeReader(bus)
         print(f"{activity} {address}", flush=True)
