@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,6 +19,11 @@ from pathlib import Path
 from typing import BinaryIO, NoReturn
 
 TOOLS = Path(__file__).resolve().parent
+
+INTERRUPT = {signal.SIGINT}
+if __name__ == "__main__":
+    # One that comes while modules are loaded waits until exit_code can report it in a line.
+    signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
 
 sys.path.insert(0, str(TOOLS / "src"))
 
@@ -295,6 +301,7 @@ def main() -> int:
             if options.command == "sim" and (was_built or sys.stderr.isatty()):
                 print_status("starting the drive")
     python = str(VENV / "bin/python")
+    signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
     os.execv(python, [python, "-m", "salient", *sys.argv[1:]])
 
 

@@ -104,6 +104,15 @@ def test_mistake_in_the_tools_keeps_its_traceback(salient_without_build: Callabl
         salient_without_build("machine", "saturating")
 
 
+def test_interrupt_while_modules_are_loaded_is_one_line(tmp_path: Path) -> None:
+    """As the launcher executes the command: with the signal blocked, which has come before it can be handled."""
+    code = ("import os, signal, sys; signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}); "
+            "os.kill(os.getpid(), signal.SIGINT); os.execv(sys.argv[1], sys.argv[1:])")
+    done = subprocess.run([sys.executable, "-c", code, *SALIENT, "machine", "saturating"], cwd=tmp_path,
+                          capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "salient: interrupted\n")
+
+
 def test_interrupt_of_the_preparation_is_one_line(tmp_path: Path) -> None:
     """A pip that takes its time, in a copy of what the launcher needs."""
     code = ("import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "

@@ -5,6 +5,7 @@ import difflib
 import errno
 import os
 import select
+import signal
 import sys
 from collections.abc import Callable, Iterable
 
@@ -65,6 +66,7 @@ def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: No
     file of a write that failed.
     """
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by the launcher while modules are loaded
         with guarded():
             try:
                 code = command()
