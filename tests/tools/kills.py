@@ -104,7 +104,7 @@ KINDS = {
     "cluster": Kind("{folder}/cluster 40", module="salient.experiments.campaign.cluster"),
     "vm": Kind("--force-vm -- true", module="salient.vm.run"),
     "pytest": Kind("-v -n 2 -p no:cacheprovider --basetemp {folder}/basetemp {folder}/test_some.py", module="pytest"),
-    "suite": Kind("-v -n 2 -p no:cacheprovider {root}/tests/hil/test_raw_frames.py", module="pytest"),
+    "suite": Kind("-v -n 2 -p no:cacheprovider {root}/tests/hil/test_identity.py", module="pytest"),
 }
 WRITES_THE_TREE = ("fault_table",)
 """Kinds whose undisturbed run would write a committed page: they are killed, and never run to their end."""
