@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,12 +82,12 @@ def _print(line: str) -> None:
     print(line, flush=True)
 
 
-def _succeeds(*command: str | Path, quiet: bool = True, **environment: str) -> bool:
+def _succeeds(*command: str | Path, quiet: bool = True, environment: Mapping[str, str] | None = None) -> bool:
     """Runs a command in the repository's root; quiet: its output is shown only when it fails."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=ROOT,
-        env={**os.environ, **environment},
+        env={**os.environ, **(environment or {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE if quiet else None,
         stderr=subprocess.STDOUT if quiet else None,
@@ -222,7 +222,7 @@ def _ctest(preset: str) -> Count:
     overview = results / "ctest-overview"
     options, environment = _test_preset(preset)
     _succeeds("ctest", "--test-dir", BUILD / preset, *options, "--parallel", str(CORES), "--output-junit", overview,
-              GTEST_OUTPUT=f"xml:{results}/", **environment)
+              environment={**environment, "GTEST_OUTPUT": f"xml:{results}/"})
     count = Count()
     if not overview.exists():
         return Count(failed=1)
@@ -294,7 +294,8 @@ def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequen
         options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
     # The processes share the cores: threads of NumPy's linear algebra would only wait for one another.
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                     f"--junitxml={report}", *options, *files, quiet=quiet, OPENBLAS_NUM_THREADS="1")
+                     f"--junitxml={report}", *options, *files, quiet=quiet,
+                     environment={"OPENBLAS_NUM_THREADS": "1"})
     count = _read_report(report)
     # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
