@@ -226,6 +226,7 @@ def test_session_fails_when_the_emulator_is_killed(make_bench, monkeypatch):
     process._process.returncode = 0  # the fixture closes it again
 
 
+@pytest.mark.in_turns
 def test_failure_leaves_log_plot_seed_and_replay_command(tmp_path):
     (tmp_path / "test_failing.py").write_text(FAILING_TEST)
     failures = tmp_path / "failures"

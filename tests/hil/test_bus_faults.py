@@ -106,6 +106,7 @@ def test_heartbeat_and_commands_pass_a_babbling_node_of_the_lowest_priority(benc
     assert bench.telemetry["telemetry_dropped"].last == 0
 
 
+@pytest.mark.in_turns
 def test_bus_off_100_times_and_back_and_the_drive_never_runs_by_itself(bench):
     """The sender of commands continues throughout: it requests run all the time."""
     running(bench)
@@ -136,6 +137,7 @@ def test_first_bus_off_is_left_after_10_ms_and_128_times_11_bits(bench):
     assert bench.telemetry["bus_off_count"].last in (0, 1)  # sent each 100 ms
 
 
+@pytest.mark.in_turns
 def test_bus_off_again_as_soon_as_the_controller_has_rejoined_is_left_by_the_next_attempt(bench):
     running(bench)
     for again_ms in range(20):  # within the steps of 1 ms in which the drive reads the state of the controller

@@ -49,6 +49,7 @@ def _settled(tmp_path, load_Nm: float = 8.0, **fields):
     return EXTRACTORS["encoder_course"](scenario, result.recording)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "controller", "bits", "edges", "speed_rpm", "load_Nm"), [
     ("saturating", "salient", 9, False, 1.0, 8.0),
     ("saturating", "salient", 12, False, 0.5, 8.0),

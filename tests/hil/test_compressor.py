@@ -27,6 +27,7 @@ def swing_rpm(scenario: Scenario, folder: Path) -> float:
     return float(np.ptp(result.recording["speed_rpm"]))
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("condition", [
     "saturating, one cylinder, 600 r/min", "saturating, two cylinders, 1500 r/min",
     "finite_element, one cylinder, 1500 r/min", "finite_element, two cylinders, 600 r/min"])

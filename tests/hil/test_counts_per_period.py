@@ -46,6 +46,7 @@ def speed_rpm(counts: float, bits: int, rate_hz: int) -> float:
     return round(counts * rate_hz / 2**bits * 60.0, 4)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "rate_hz", "counts"), [
     ("saturating", 40_000, 3.0081), ("saturating", 40_000, 6.0036), ("saturating", 40_000, 6.4990),
     ("saturating", 40_000, 8.4989), ("saturating", 40_000, 12.0078), ("saturating", 20_000, 9.0046),

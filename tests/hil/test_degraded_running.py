@@ -39,6 +39,7 @@ def current_b(bench: Bench, from_s: float):
 
 # Without its phase the rotor slows down under the load for less than a stroke: 8.3 ms of 6 N m take 24 r/min from
 # 0.02 kg m^2.
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("machine", MACHINES)
 def test_lost_phase_under_load_leaves_the_speed_at_its_reference(make_bench, machine, controller):
@@ -116,6 +117,7 @@ def test_what_cannot_be_run_on_with_is_a_fault(make_bench, controller, kind, att
     assert bench.drive.fault in faults
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_of_four_phases_the_three_that_remain_show_a_sensor_with_a_wrong_gain(make_bench, controller):
     bench = loaded(make_bench, machine=str(FOUR_PHASES), controller=controller, load_Nm=4.0)

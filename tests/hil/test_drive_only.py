@@ -70,6 +70,7 @@ def test_of_the_bench(bench):
 """
 
 
+@pytest.mark.in_turns
 @pytest.mark.both_transports
 def test_suite_on_the_bus_of_a_drive_alone_skips_what_needs_the_bench(request, tmp_path):
     interface = request.config.getoption("--salient-can")

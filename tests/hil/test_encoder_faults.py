@@ -245,6 +245,7 @@ def test_clear_fault_in_run_is_refused_and_counted(bench):
 # --- Healthy encoders ---
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "controller", "ahead_deg", "flux_linkage_gain", "speed_rpm"), [
     ("linear_cosine", "paper", 2.0, 0.9, 600),
     ("saturating", "salient", 4.0, 0.9, 600),
@@ -280,6 +281,7 @@ SPECIFIED = {"current_sensor_gain": 1.05, "current_sensor_offset_A": 0.5, "curre
              "resistance_gain": 1.4, "current_sensor_delay_us": 3.0, "supply_voltage_V": 220.0}
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("errors", [{}, SPECIFIED], ids=["ideal", "specified_errors"])
 @pytest.mark.parametrize(("machine", "controller", "bits", "edges", "speed_rpm", "load_Nm"), HEALTHY)
 def test_healthy_encoder_is_no_fault(  # noqa: PLR0913, PLR0917 - a case has as many parameters

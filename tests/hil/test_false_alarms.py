@@ -16,6 +16,7 @@ def expect_no_fault(seed: int, machine: str, controller: str, rate_hz: int) -> N
     assert result["virtual_us"] == pytest.approx(drawn["duration_us"], abs=1000)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("seed", "machine", "controller"), [
     (323, "linear_cosine", "paper"), (655, "random_07", "paper"), (716, "random_07", "traditional"),
     (350, "random_08", "paper"), (1625, "saturating", "paper"), (5988, "map86", "traditional")])
@@ -23,6 +24,7 @@ def test_no_current_reaches_the_trip_at_20_khz(seed, machine, controller):
     expect_no_fault(seed, machine, controller, 20_000)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("seed", "machine", "controller", "rate_hz"), [
     (8679, "saturating", "salient", 20_000), (46979, "finite_element", "salient", 20_000),
     (14057, "random_01", "traditional", 20_000)])
@@ -30,6 +32,7 @@ def test_currents_that_end_between_two_checks_do_not_contradict_the_angle(seed, 
     expect_no_fault(seed, machine, controller, rate_hz)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("seed", "machine", "controller", "rate_hz"), [
     (164, "fan12", "paper", 50_000), (2712, "spindle", "paper", 100_000), (2425, "random_01", "traditional", 20_000),
     (10423, "spindle", "salient", 100_000), (13801, "traction", "paper", 40_000)])

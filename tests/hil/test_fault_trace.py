@@ -34,6 +34,7 @@ def at(bench: Bench, name: str, times_s: np.ndarray) -> np.ndarray:
     return np.asarray(signal.value)[rows]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize("control_rate_hz", [20000, 40000])
 def test_every_row_is_the_true_state_at_the_start_of_its_period(make_bench, controller, control_rate_hz):
@@ -107,6 +108,7 @@ def test_a_fault_right_after_the_start_has_rows_of_zeros_before_the_start(bench)
     assert not trace.upper_duty.any()
 
 
+@pytest.mark.in_turns
 def test_scope_writes_the_buffer_as_table_and_plot_and_says_when_there_is_none(tmp_path, capsys):
     can, out = f"unix:{tmp_path}/bus.sock", tmp_path / "out"
     arguments = make_parser().parse_args(["scope", "--can", can, "--out", str(out)])

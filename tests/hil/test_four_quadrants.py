@@ -83,6 +83,7 @@ def test_stop_brakes_to_standstill_and_opens_the_switches(bench, direction, agai
     assert bench.drive.fault == "none"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("direction", [1, -1])
 def test_brakes_from_3000_rpm_within_the_current_limit(make_bench, machine, direction):

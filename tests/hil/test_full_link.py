@@ -21,6 +21,7 @@ def running(bench: Bench, speed_rpm: float) -> None:
     bench.rig.truth_period_us = 250
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("inertia", [0.3, 1.0, 4.0])
 @pytest.mark.parametrize("speed_rpm", [600, 1500, 2500, -1500])
 @pytest.mark.parametrize("target", ["standstill", "reverse"])
@@ -89,6 +90,7 @@ def test_a_chopper_that_opens_while_it_conducts_takes_no_more(make_bench):
     assert voltage_V == pytest.approx(conducting_V, abs=0.1)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("chopper_ohm", [12.0, 16.0, 24.0, None])
 @pytest.mark.parametrize("speed_rpm", [2250, 3000])
 def test_the_largest_braking_torque_of_the_current_limit_at_once_is_no_trip(

@@ -34,6 +34,7 @@ def fall_together(currents: list[float]) -> bool:
     return all(later < earlier or later == 0 for earlier, later in pairwise(currents))
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize("gain", [0.0, 0.3])
 def test_true_current_stays_below_1_2_times_the_trip_with_dead_or_weak_sensors(make_bench, controller, gain):
@@ -69,6 +70,7 @@ def test_either_line_of_safe_torque_off_opens_the_switches_at_once(bench, line, 
     assert bench.telemetry[f"DRIVE_GATES.{line}"].last_name == "torque_off"
 
 
+@pytest.mark.in_turns
 def test_safe_torque_off_is_reported_within_a_period_and_is_cleared_only_when_both_lines_are_energised(bench):
     running(bench)
     off_us = bench.time_ns / 1000

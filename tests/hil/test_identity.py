@@ -96,6 +96,7 @@ def supply_V(path: Path) -> float:
         return float(file.get(group=group, index=index).samples[-1])
 
 
+@pytest.mark.in_turns
 def test_every_tool_finds_the_machine_of_a_drive(other_drive, tmp_path, capsys):
     assert monitor(other_drive, 0.05, 0.2, None) == 0
     read_V = {float(text) for text in re.findall(r"DC link +([\d.]+) V", capsys.readouterr().out)}

@@ -14,6 +14,7 @@ from salient.experiments.compare.random_machines import random_machine
 from salient.experiments.scenario import run_scenario
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["fan12", "traction", "map86", "spindle"])
 def test_starts_takes_a_load_step_brakes_and_reverses_near_its_bounds(machine, tmp_path):
     scenario = every_machine.scenario(EXAMPLES / f"{machine}.toml", "salient")
@@ -28,6 +29,7 @@ def test_starts_takes_a_load_step_brakes_and_reverses_near_its_bounds(machine, t
     assert 0.005 < values["ripple"] < 0.02
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("number", [13, 15])
 def test_light_rotor_starts_and_reverses_near_its_bounds_without_overshoot(number, tmp_path):
     file = tmp_path / f"random_{number}.toml"

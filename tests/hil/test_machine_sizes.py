@@ -78,6 +78,7 @@ def test_similar_machine_runs_to_the_bit_as_its_model(make_bench, similar_files,
     assert similar == frames_of_a_load_step(make_bench, "saturating", controller, 8.0)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize(("name", "speed_rpm", "load_Nm"), [
     ("smallest", 400.0, 0.02), ("largest", 1000.0, 800.0), ("fastest", 12_000.0, 0.4),

@@ -20,6 +20,8 @@ from salient.experiments.metrics import RIPPLE_WINDOW_S, load_step_metrics, star
 from salient.experiments.scenario import Scenario, load_scenarios, run_scenario
 from salient.paths import SCENARIOS
 
+pytestmark = pytest.mark.in_turns
+
 ANGLES_DEG = range(0, 90, 10)
 GRIDS = {"map_regular": (REGULAR_DEG, REGULAR_A), "map_irregular": irregular()}
 

@@ -34,6 +34,7 @@ def test_ripple_under_load(make_bench, tmp_path, machine, rate_hz, speed_rpm, le
     assert least < ripple(np.load(record), 0.3) < most
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["saturating", "linear_trapezoid", "finite_element"])
 def test_a_load_step_at_any_angle_of_the_hand_over_stays_below_the_trip(make_bench, machine):
     """The outgoing phase keeps its duty: none that raises its current."""

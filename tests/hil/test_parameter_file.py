@@ -33,6 +33,7 @@ def parameters(*arguments: object) -> subprocess.CompletedProcess[str]:
                           capture_output=True, stdin=subprocess.DEVNULL)
 
 
+@pytest.mark.in_turns
 def test_saved_file_has_every_parameter_with_its_unit_and_is_equal_to_the_drive(can, tmp_path: Path):
     file = tmp_path / "drive.toml"
     saved = parameters("save", file, "--can", can)
@@ -45,6 +46,7 @@ def test_saved_file_has_every_parameter_with_its_unit_and_is_equal_to_the_drive(
     assert (compared.returncode, compared.stdout) == (0, f"0 of {len(rows)} parameters differ\n")
 
 
+@pytest.mark.in_turns
 def test_values_that_select_something_have_names(can, tmp_path: Path):
     file = tmp_path / "drive.toml"
     assert parameters("save", file, "--can", can).returncode == 0
@@ -75,6 +77,7 @@ def test_names_of_values_are_those_of_the_table():
             assert re.search(rf"\b{number} (of (the|a) )?{value.replace('_', ' ')}\b", row.text), (name, value)
 
 
+@pytest.mark.in_turns
 def test_loaded_file_is_in_the_drive_and_differences_are_listed(can, tmp_path: Path):
     file = tmp_path / "drive.toml"
     file.write_text("over_speed_rpm = 1234\ncurrent_trip_A = 60.3\n")
@@ -98,6 +101,7 @@ def test_loaded_file_is_in_the_drive_and_differences_are_listed(can, tmp_path: P
     assert parameters("compare", file, "--can", can).returncode == 0
 
 
+@pytest.mark.in_turns
 def test_each_bad_entry_is_one_line_and_nothing_is_set(can, tmp_path: Path):
     file = tmp_path / "drive.toml"
     file.write_text('over_speed_rpm = 1234\nspeed = 5\ncurrent_trip_A = 99\ncurrent_limit_A = "much"\n'
@@ -117,6 +121,7 @@ def test_each_bad_entry_is_one_line_and_nothing_is_set(can, tmp_path: Path):
         assert session.drive.parameters["over_speed_rpm"] == 3600
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("content", "expected"), [("over_speed_rpm = = 3", "not TOML"), (None, "no such file")])
 def test_file_that_cannot_be_read_is_named(can, tmp_path: Path, content: str | None, expected: str):
     file = tmp_path / "drive.toml"

@@ -305,6 +305,7 @@ TUNED = {
 }
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", TUNED)
 def test_gains_change_in_a_run_without_a_bump(make_bench, controller: str):
     bench = make_bench(controller=controller)

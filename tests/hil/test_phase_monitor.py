@@ -70,6 +70,7 @@ def until_fault(bench, timeout_s: float = 0.1) -> float:
     return bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last * 1e-6
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", CELLS)
 def test_fault_of_a_phase_is_named_within_its_time(make_bench, name, controller):
@@ -145,6 +146,7 @@ def test_a_phase_that_is_whole_again_runs_after_clearing(make_bench, controller)
     assert bench.truth["RIG_TRUTH_MOTION.speed_rpm"].last == pytest.approx(SPEED_RPM, abs=6.0)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("machine", ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"])

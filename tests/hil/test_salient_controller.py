@@ -114,6 +114,7 @@ def test_starts_to_600_rpm_at_the_torque_limit_without_overshoot(run_recorded, m
     assert 600.0 < result["max_speed_rpm"] < (600.3 if machine == "finite_element" else 600.1)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("pulses", [1, 2])
 @pytest.mark.parametrize("machine", MACHINES)
 def test_8_Nm_load_step_at_150_rpm_is_compensated_with_low_ripple(run_recorded, machine, pulses):

@@ -163,6 +163,7 @@ def test_minimum_pulse_suppresses_pulses(tmp_path):
 # --- the board --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("bits", [12, 14, 16])
 def test_adc_has_the_resolution_of_its_bits(make_bench, bits):
     bench = make_bench(controller="paper", adc_bits=bits)

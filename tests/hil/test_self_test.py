@@ -115,6 +115,7 @@ def test_what_the_host_has_not_is_unsupported(bench):
     assert memory_item(bench, "code_passes") == memory_item(bench, "stack_unused") == 0
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("build", ["cortex-m4", "rv32"])
 @pytest.mark.parametrize("case", ["current trip", "state, run to fault", "period of the timer", "guard of the stack"])
 def test_change_on_a_target_is_a_fault_in_time(make_bench, build, case):
@@ -142,6 +143,7 @@ def test_a_flipped_bit_of_the_program_is_found_at_a_start_which_it_prevents(make
     assert bench.drive.state == "ready"
 
 
+@pytest.mark.in_turns
 def test_program_is_checked_within_a_minute_and_the_stack_has_unused_words(make_bench):
     bench = make_bench(build="cortex-m4", telemetry_period_ms=100)
     bench.run_for(5.0)

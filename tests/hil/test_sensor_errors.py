@@ -116,6 +116,7 @@ def angle_error_deg(bench: Bench, start_s: float) -> tuple[np.ndarray, np.ndarra
     return (measured - true + 180) % 360 - 180, true
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 @pytest.mark.parametrize("name", CASES)
 def test_starts_and_holds_speed_under_load(make_bench, controller, name):
@@ -157,6 +158,7 @@ def test_measured_currents_have_the_injected_error(bench, variable, value, wrong
     assert np.abs(measured_A - true_A).max() > 0.45
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("delay_us", [1, 3, 8])
 def test_measured_currents_lag_by_the_sensor_delay(bench, delay_us):
     """With the traditional controller, which applies 240 V to a phase for whole periods."""

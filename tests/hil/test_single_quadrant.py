@@ -15,6 +15,7 @@ def currents_A(bench: Bench, since_s: float) -> np.ndarray:
     return np.concatenate([signal.between(since_s, bench.time_s + 1e-9).value for signal in signals])
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("backwards_rpm", "load_Nm"), [(-150, 0), (-600, 6), (-2000, 0)])
 @pytest.mark.parametrize("machine", ["saturating", "linear_cosine", "linear_trapezoid", "finite_element"])
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
@@ -38,6 +39,7 @@ def test_brakes_a_rotor_that_turns_backwards_and_starts_it_forwards(make_bench, 
     assert 295 < steady.min() < steady.max() < 310
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["saturating", "linear_cosine", "linear_trapezoid", "finite_element"])
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_at_20_khz_a_rotor_close_to_the_speed_limit_is_braked_below_the_trip(make_bench, controller, machine):

@@ -94,6 +94,7 @@ def make_run(make_bench, tmp_path):
     return make
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("rate_hz", [20_000, 40_000])
 @pytest.mark.parametrize(("name", "capacitance_F", "chopper_ohm"), SMALL)
 def test_reversal_from_the_highest_speed_fills_a_small_link_without_a_trip(make_run, name, capacitance_F, chopper_ohm,
@@ -110,6 +111,7 @@ def test_reversal_from_the_highest_speed_fills_a_small_link_without_a_trip(make_
     assert run.bench.truth["speed_rpm"].last < 0.97 * highest_rpm, "it brakes"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize(("name", "capacitance_F", "chopper_ohm"), SMALL)
 def test_braking_torque_at_once_at_a_held_speed_is_no_trip_and_at_least_half_of_what_a_chopper_takes(

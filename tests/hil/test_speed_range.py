@@ -44,6 +44,7 @@ def is_limited(bench):
     return bench.telemetry["DRIVE_STATUS.speed_limited"].last == 1
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("controller", "sign"), DIRECTIONS)
 def test_a_command_beyond_the_highest_speed_is_limited_to_it_and_reported(make_bench, slow, controller, sign):
     bench = make_bench(machine=slow, controller=controller)
@@ -113,6 +114,7 @@ def test_client_refuses_a_speed_beyond_the_range_in_one_line_that_names_it(make_
     assert bench.drive.state != "run"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("over_speed_rpm", [1080.0, 1000.0, 910.0])
 def test_range_of_the_database_is_what_the_drive_follows_with_the_parameters_of_the_file(make_bench, slow,
                                                                                          over_speed_rpm):

@@ -41,6 +41,7 @@ def ripple(bench, window_s=0.1):
 
 # --- flux linkage and resistance ------------------------------------------------------------------------------------
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["finite_element", "saturating", "linear_trapezoid"])
 @pytest.mark.parametrize(("flux", "resistance"), [(0.8, 1.3), (1.2, 0.7)])
 @pytest.mark.parametrize(("speed", "torque"), [(0.1, 0.75), (-1.0, 0.5), (1.3, -0.3)])
@@ -153,6 +154,7 @@ def alternating(bench, torque_Nm, half_s, halves):
     return np.array(found)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("gain", [0.95, 1.0, 1.05])
 @pytest.mark.parametrize(("machine", "half_s"), [("saturating", 0.15), ("finite_element", 0.06)])
 def test_free_shaft_of_known_inertia_shows_the_gain_of_the_current_sensors(make_bench, machine, half_s, gain):

@@ -19,6 +19,7 @@ def load_percent(bench: Bench, part: str = "winding") -> float:
     return bench.telemetry[f"{THERMAL}{part}_load"].last
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"])
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 def test_rated_torque_below_base_speed_is_continuous(make_bench, machine, controller):
@@ -37,6 +38,7 @@ def test_rated_torque_below_base_speed_is_continuous(make_bench, machine, contro
     assert bench.drive.state == "run"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize("hot", ["winding", "switch"])
 def test_torque_falls_before_the_trip_and_settles_between_90_and_100_percent(make_bench, controller, hot):

@@ -36,6 +36,7 @@ def held(bench, machine, speed_rpm: float, torque_Nm: float):
     return np.asarray(made_Nm, dtype=float), float(square_A2)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("name", "of_base", "part", "ripple_max"), [
     ("saturating", 0.1, 0.5, 0.01), ("finite_element", 0.1, 0.5, 0.012), ("finite_element", 1.0, 0.25, 0.035),
     (NARROW_64, 0.1, 0.5, 0.01), (NARROW_64, 1.0, 0.5, 0.04), (NARROW_86, 0.5, 0.25, 0.04),
@@ -53,6 +54,7 @@ def test_sum_of_squares_of_the_currents_is_within_6_percent_of_the_least_without
     assert 0.98 < square_A2 / least_A2 < 1.06
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("name", [NARROW_64, NARROW_128])
 def test_largest_torque_by_default_is_made_at_every_angle_and_is_what_the_current_limit_gives(make_bench, name):
     machine = load_machine(machine_path(name))

@@ -85,6 +85,7 @@ def test_an_open_winding_of_a_small_machine_is_found_within_a_revolution_cold_or
     assert 45e-6 <= detected_s < 1.05 * 60.0 / (0.5 * BASE_RPM) / 4.0
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("number", [11, 75, 258, 420, 489])
 def test_healthy_drives_of_the_whole_range_with_warm_windings_are_no_false_alarm(number):
     """Drives of experiments.healthy_drives that tripped once."""

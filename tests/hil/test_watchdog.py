@@ -45,6 +45,7 @@ def currents_A(bench: Bench, from_s: float) -> list[float]:
         signals[0].time_s, *(each.value for each in signals), strict=True) if time_s >= from_s]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "salient"])
 @pytest.mark.parametrize("hang", HANGS)
 def test_what_hangs_ends_within_20_ms_with_open_switches_and_a_drive_in_fault(make_bench, controller, hang):

@@ -26,6 +26,8 @@ from reference_plant import (
 )
 from test_plant_against_scipy import machine_of
 
+pytestmark = pytest.mark.in_turns
+
 PHASES = 3
 FULL = 2500
 PERIODS = 1200

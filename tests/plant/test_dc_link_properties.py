@@ -22,6 +22,8 @@ from reference_plant import SAMPLE, Converter, DcLink, Run, State, load_library,
 from test_energy_balance import BalanceTerms
 from test_plant_properties import FORMS, SEED, Case, random_machine, random_pattern
 
+pytestmark = pytest.mark.in_turns
+
 CASES = int(os.environ.get("SALIENT_PLANT_CASES", "36"))
 PERIODS = 20
 BOUND = 1e-5

@@ -15,6 +15,8 @@ from reference_plant import Converter, DcLink, Machine, Run, State, load_library
 from salient.machine.file import load_machine
 from salient.paths import MACHINES
 
+pytestmark = pytest.mark.in_turns
+
 FULL = 2500
 PERIODS = 40_000
 BOUND = 1e-6

@@ -27,6 +27,8 @@ from salient.machine.file import load_machine
 from salient.paths import MACHINES
 from salient.reference import ngspice
 
+pytestmark = pytest.mark.in_turns
+
 START_NS = {"single_pulse": 7_333_000, "hard_chopping": 13_383_000}  # in the second electrical period, under current
 SAMPLES_NS = (1237, 3331, 5003, 7777)  # within each control period, on no edge
 SHORTED = 0.1

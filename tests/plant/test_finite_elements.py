@@ -49,6 +49,7 @@ def table() -> np.ndarray:
     return rows[:, 2].reshape(len(angles_deg), len(CURRENTS_A))
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(
     ("angle_deg", "current_A"), [(0, 1), (0, 80), (6.5, 20), (13, 40), (20.5, 10), (21, 80), (27.5, 32), (30, 6)]
 )
@@ -71,6 +72,7 @@ def test_flux_linkage_rises_with_the_current_and_falls_with_the_angle_everywhere
     assert np.all(np.diff(table(), axis=0) < 0.0)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(
     ("angle_deg", "current_A", "rise"),
     # Measured: 0.0027, 0.0036; where the corners of the poles meet, 0.016.
@@ -82,6 +84,7 @@ def test_half_the_mesh_size_changes_flux_linkage_by_less_than_a_percent_except_a
 
 
 # Measured: within 0.7 %. Where the corners of the poles meet, at 21 deg, the grid of the map smooths the torque: 4 %.
+@pytest.mark.in_turns
 @pytest.mark.parametrize("angle_deg", [2.5, 10.0, 19.0, 25.0])
 @pytest.mark.parametrize("current_A", [20, 40, 80])
 def test_torque_of_the_co_energy_is_that_of_maxwells_stress_tensor(angle_deg, current_A):
@@ -91,6 +94,7 @@ def test_torque_of_the_co_energy_is_that_of_maxwells_stress_tensor(angle_deg, cu
     assert magnetics.torque_Nm(np.radians(angle_deg), current_A) == pytest.approx(stress_Nm, rel=0.01)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("gap_mm", [0.5, 0.1])
 def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
     geometry = replace(GEOMETRY, gap=gap_mm)
@@ -106,6 +110,7 @@ def test_ideal_iron_has_the_inductance_of_the_air_gap_and_its_fringing(gap_mm):
     assert fringing[0] < flux_Wb / gap_inductance_H(geometry) - 1.0 < fringing[1]
 
 
+@pytest.mark.in_turns
 def test_field_has_the_symmetries_of_the_machine():
     flux_Wb, torque_Nm = solved(12.0, 30.0)
     for angle_deg, sign in ((-12.0, -1.0), (60.0 - 12.0, -1.0), (60.0 + 12.0, 1.0), (180.0 + 12.0, 1.0)):

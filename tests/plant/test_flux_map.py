@@ -68,6 +68,7 @@ def worst(flux_map: FluxMap, name: str, up_to_A: float) -> tuple[float, float]:
     return deviations[0], deviations[1]
 
 
+@pytest.mark.in_turns
 def test_map_of_the_saturating_formula_reproduces_the_formula(sampled):
     grid, flux_map = sampled
     flux, torque = worst(flux_map, "saturating", CURRENT_MAX_A)
@@ -81,6 +82,7 @@ def test_map_of_the_saturating_formula_reproduces_the_formula(sampled):
     assert flux_map.current_max_A == pytest.approx(min(reached_A), rel=1e-9)
 
 
+@pytest.mark.in_turns
 def test_finer_maps_converge_to_the_formula(tmp_path):
     deviations = []
     for count in (10, 20, 40):
@@ -224,6 +226,7 @@ def plant_machine(flux_map: FluxMap) -> Machine:
     return machine
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("stroke", [chopping_stroke, single_pulse])
 def test_plant_agrees_with_an_independent_integration(sampled, library, stroke):
     _, flux_map = sampled

@@ -164,6 +164,7 @@ def test_unit_is_valid(name):
     assert validate_fmu(str(unit_path(name))) == []
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("form", "step_ns"), [("saturating", 5000), ("linear_cosine", 25000),
                                                ("linear_trapezoid", 25000), ("finite_element", 25000)])
 def test_run_in_fmpy_is_bit_identical_to_the_native_run(library, form, step_ns):
@@ -303,6 +304,7 @@ def test_description_of_another_unit_is_rejected(units):
         assert len(messages) == 1 and b"instantiation token" in messages[0]
 
 
+@pytest.mark.in_turns
 def test_the_build_of_a_unit_is_deterministic(tmp_path):
     """Packing the same inputs again gives the same bytes, independent of file name and time."""
     unit = unit_path("saturating")

@@ -27,6 +27,8 @@ from salient.machine.file import load_machine
 from salient.paths import MACHINES
 from salient.reference import ngspice
 
+pytestmark = pytest.mark.in_turns
+
 PERIOD_TICKS = 1000  # 100 kHz: hard chopping is by whole periods
 ELECTRICAL_PERIODS = 2
 SAMPLE_NS = 1000

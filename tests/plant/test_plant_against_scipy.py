@@ -30,6 +30,8 @@ from reference_plant import (
     set_switches,
 )
 
+pytestmark = pytest.mark.in_turns
+
 PHASES = 3
 
 

@@ -31,6 +31,8 @@ from reference_plant import (
     run_reference,
 )
 
+pytestmark = pytest.mark.in_turns
+
 SEED = int(os.environ.get("SALIENT_PLANT_SEED", "20250611"))
 CASES = 900
 PERIODS = 20

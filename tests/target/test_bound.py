@@ -363,6 +363,7 @@ def compiled(folder: Path, body: str, compiler: list[str], optimisation: str) ->
     return Model(ElfImage(folder / "x.elf"), Facts(), "only", root=folder)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("compiler", [CORTEX_M4, RV32], ids=["cortex-m4", "rv32"])
 @pytest.mark.parametrize("optimisation", ["-O1", "-O2", "-Os"])
 @pytest.mark.parametrize(("statement", "iterations"), [
@@ -510,6 +511,7 @@ def test_names_have_the_values_of_image_and_headers(machine, phases):
 RUNS = [*(("cortex-m4", variant) for variant in long_run.VARIANTS), *(("rv32", variant) for variant in CONTROLLERS)]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("build", "variant"), RUNS)
 def test_every_run_is_a_path_within_the_facts_and_the_bound(variant, build):
     found = bound(variant, build)
@@ -533,6 +535,7 @@ def test_longest_path_has_the_instructions_of_the_bound():
     assert not {"bp_network", "ditc_hysteresis", "pwm_ditc"} & set(modules)
 
 
+@pytest.mark.in_turns
 def test_each_variant_has_facts_of_its_configuration():
     facts = read_facts(FILE)
     known = {of.controller for of in long_run.VARIANTS.values()}

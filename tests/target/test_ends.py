@@ -83,6 +83,7 @@ def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
 
 
+@pytest.mark.in_turns
 def test_cpu_exception_is_reported_and_the_recording_is_kept(make_image, tmp_path: Path):
     result = run(make_image(layout_of_world()), tmp_path)
     assert result.returncode == EXIT_FAULT

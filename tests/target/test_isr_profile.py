@@ -24,6 +24,7 @@ CONTROL_EXCEPTION = 16 + 31
 PENDSV = 14
 
 
+@pytest.mark.in_turns
 def test_equal_runs_execute_equal_instructions():
     first, second = (measure("salient") for _ in range(2))
     assert (first.interrupts == second.interrupts).all()
@@ -44,6 +45,7 @@ DEFERRED = {
 """Modules of which only the deferred interrupt executes instructions."""
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_modules_account_for_every_instruction_and_belong_to_the_controller(controller):
     profile = measure(controller)
@@ -59,6 +61,7 @@ def test_modules_account_for_every_instruction_and_belong_to_the_controller(cont
         assert of.executed > 0.5 * of.instructions and of.in_interrupts == 0, name
 
 
+@pytest.mark.in_turns
 def test_arithmetic_that_is_not_inlined_counts_for_its_callers():
     profile = measure("paper", "cortex-m4-Os")
     functions = {one.function for one in ElfImage(profile.trace.image).instructions()}
@@ -126,6 +129,7 @@ def interrupts_in(log: Path) -> tuple[dict[str, list[int]], Counter[int]]:
     return lengths, addresses
 
 
+@pytest.mark.in_turns
 def test_counts_match_the_log_of_qemu_by_instruction(run_qemu, tmp_path):
     """QEMU's log has one line per instruction with its address; compared between the handler's entry and return."""
     log = tmp_path / "trace"
@@ -138,6 +142,7 @@ def test_counts_match_the_log_of_qemu_by_instruction(run_qemu, tmp_path):
     assert counted == +addresses
 
 
+@pytest.mark.in_turns
 def test_control_interrupt_that_preempts_the_deferred_one_is_not_part_of_its_count(tmp_path):
     """race.c requests control interrupts in its deferred step."""
     log, control = tmp_path / "trace", tmp_path / "control"
@@ -166,5 +171,6 @@ def test_each_control_interrupt_and_its_deferred_one_are_processor_exceptions(ru
     assert taken == [str(CONTROL_EXCEPTION), str(PENDSV)] * len(profile.interrupts)
 
 
+@pytest.mark.in_turns
 def test_speed_of_the_target_loop_can_be_measured():
     assert benchmark.measure("paper", "cortex-m4") > 0.0

@@ -36,6 +36,7 @@ def scenario(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.in_turns
 def test_pil_writes_the_files_of_run_and_consistent_processor_metrics(scenario, tmp_path, capsys):
     assert pil.run(options(scenario=scenario, out=tmp_path / "out")) == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -55,6 +56,7 @@ def test_pil_writes_the_files_of_run_and_consistent_processor_metrics(scenario, 
     assert "data:image/png;base64," in page and "predictive_torque" in page and "$" not in page
 
 
+@pytest.mark.in_turns
 def test_equal_runs_write_equal_pages(scenario, tmp_path):
     for name in ("first", "second"):
         pil.run(options(scenario=scenario, out=tmp_path / name))
@@ -62,6 +64,7 @@ def test_equal_runs_write_equal_pages(scenario, tmp_path):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
 
 
+@pytest.mark.in_turns
 def test_fault_of_the_drive_is_exit_code_1(tmp_path, capsys):
     path = tmp_path / "fault.toml"
     path.write_text(SCENARIO + "[parameters]\ncurrent_trip_A = 2\n")

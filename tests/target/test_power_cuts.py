@@ -12,6 +12,7 @@ from salient.paths import BUILD
 IMAGE = BUILD / "cortex-m4" / "bin" / "power_cuts.elf"
 
 
+@pytest.mark.in_turns
 def test_power_cut_at_every_operation_loses_and_mixes_nothing_on_the_cortex_m4():
     """A page of sets and of faults and the first write that erases; every pair of cuts of that one."""
     command = ["qemu-system-arm", "-nodefaults", "-display", "none", "-nic", "none", "-machine", "mps2-an386",
@@ -24,6 +25,7 @@ def test_power_cut_at_every_operation_loses_and_mixes_nothing_on_the_cortex_m4()
         assert cuts > 900 and pairs > 1000
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("build", TARGETS[1:])
 def test_reset_keeps_the_memory_and_sends_the_frames_of_the_host(make_bench, build: str):
     logs = []

@@ -72,6 +72,7 @@ def test_missing_qemu_is_reported_with_its_package(tmp_path: Path, build: str, q
     assert result.stderr == f"salient: {qemu} (Debian package {package}): No such file or directory\n"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("pace", ["lockstep", "realtime", "free"])
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, "stdin"])
 def test_ready_line_then_a_clean_end_without_the_socket(program, tmp_path: Path, pace: str, end):

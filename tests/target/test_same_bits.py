@@ -120,6 +120,7 @@ def traces(make_bench, tmp_path: Path) -> Callable[..., dict[str, Trace]]:
     return run
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", COMMON_RUNS)
@@ -136,6 +137,7 @@ def test_host_and_targets_agree_in_every_control_period(traces, request, name, c
     request.node.user_properties.append(("control_periods", host.periods * len(BUILDS[machine])))
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("board", [{"adc_bits": 16, "encoder_edges": True}, {"encoder_bits": 0, "immediate_pwm": True},
                                    {"control_rate_hz": 100_000, "encoder_bits": 24}])
 def test_other_board_options_agree_on_host_and_targets(traces, board):
@@ -152,6 +154,7 @@ def machine_file(folder: Path, stem: str, inertia: float) -> Path:
     return path
 
 
+@pytest.mark.in_turns
 def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
     """The host reads the tables, in the targets they are compiled in; the file has the name of another machine."""
     made = traces(ALL, "start_600", machine=str(machine_file(tmp_path, "saturating", 0.013)))
@@ -161,6 +164,7 @@ def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
     assert made["host"].compare_values != bundled.compare_values
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("name", ["smallest", "largest", "fastest"])
 def test_machine_at_the_end_of_the_range_agrees_on_host_and_targets(traces, name, controller):
@@ -172,6 +176,7 @@ def test_machine_at_the_end_of_the_range_agrees_on_host_and_targets(traces, name
         assert made[build] == made["host"], build
 
 
+@pytest.mark.in_turns
 def test_processes_that_build_firmware_for_machine_files_at_once_do_not_collide(tmp_path):
     """Each of two files by two processes, one build per file."""
     files = [machine_file(tmp_path, name, inertia) for name, inertia in (("my light", 0.01), ("my heavy", 0.03))]
@@ -186,6 +191,7 @@ def test_processes_that_build_firmware_for_machine_files_at_once_do_not_collide(
     assert [sum("building the firmware for" in errors for _, errors in outputs[at::2]) for at in (0, 1)] == [1, 1]
 
 
+@pytest.mark.in_turns
 def test_different_seeds_give_different_runs(traces):
     """Shows that the comparison above can fail."""
     first, second = (traces(["cortex-m4"], "tour", controller="paper", seed=seed)["cortex-m4"] for seed in (1, 2))

@@ -16,6 +16,7 @@ from salient.target.static_checks import deepest_stack, forbidden, indirect_call
 LINKED = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-O1", "-nostartfiles", "-ffreestanding", "-Wl,-e,begin"]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("build", TARGET_BUILDS)
 def test_images_have_no_floating_point_no_heap_and_no_indirect_calls(build):
     whole = ElfImage(image("saturating", build))

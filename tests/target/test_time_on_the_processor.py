@@ -75,6 +75,7 @@ def load_step_150(make_bench, tmp_path: Path, **options) -> tuple[Bench, dict]:
     return bench, {**load_step_metrics(recorded, 150, 0.13), **window}
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_timed_drive_meets_every_deadline_and_has_the_metrics_of_an_untimed_one(make_bench, tmp_path,
                                                                                           controller):
@@ -112,6 +113,7 @@ def test_reported_isr_time_is_that_of_the_counted_instructions_and_of_the_port(m
     assert 0.1 < port_us < 0.6
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("rate_hz", [20_000, 50_000])
 def test_timer_keeps_other_control_periods(make_bench, rate_hz):
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8, control_rate_hz=rate_hz)
@@ -149,6 +151,7 @@ def slow_processor(make_bench, controller: str) -> dict[str, int]:
     raise AssertionError("no processor is fast enough")
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["paper", "salient"])
 def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, controller):
     slow = slow_processor(make_bench, controller)
@@ -177,6 +180,7 @@ def test_slow_processor_is_detected_reported_and_safe_reproducibly(make_bench, c
     assert run()[1] == first
 
 
+@pytest.mark.in_turns
 def test_overrun_under_load_opens_every_switch(make_bench):
     """The bench delays by 24 us an interrupt that otherwise meets its deadline."""
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
@@ -207,6 +211,7 @@ def test_overrun_under_load_opens_every_switch(make_bench):
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
 
 
+@pytest.mark.in_turns
 def test_interrupt_time_of_the_bench_adds_to_the_processor_time(make_bench):
     bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
     used_us = {}
@@ -276,6 +281,7 @@ def race(tmp_path: Path) -> Callable[..., Race]:
 TIMED_BUILDS = [build for build in TARGET_BUILDS if build.startswith("cortex-m4")]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("build", TIMED_BUILDS)
 def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race, build):
     """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
@@ -287,6 +293,7 @@ def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race
     assert found.torn == (0, 0, 0, 0, 0)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("build", "timed"), [*((build, False) for build in TARGET_BUILDS),
                                               *((build, True) for build in TIMED_BUILDS)])
 def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only_without_the_exchange(race, build,
@@ -303,6 +310,7 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
 # --- tuning ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("controller", "tuned"), [
     ("traditional", {"speed_kp": 4.0, "observer_bandwidth_rad_s": 600.0}),
     ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0}),
@@ -325,6 +333,7 @@ def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_microsecond
 # --- the deferred interrupt -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_deferred_interrupt_ends_within_the_period_and_its_time_is_reported(make_bench, controller):
     bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8 if controller == "salient" else 4)
@@ -350,6 +359,7 @@ def held(make_bench, held_us: float) -> Bench:
     return bench
 
 
+@pytest.mark.in_turns
 def test_late_deferred_interrupt_is_counted_and_one_that_does_not_end_is_a_fault(make_bench):
     bench = held(make_bench, 10)
     assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == 0

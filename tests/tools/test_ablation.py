@@ -83,6 +83,7 @@ def test_a_row_is_missed_beyond_the_scatter_of_the_seeds_and_when_runs_fail() ->
     assert failing.is_missed and failing.failed == 1
 
 
+@pytest.mark.in_turns
 def test_one_mechanism_is_removed_and_measured_and_kept(tmp_path: Path) -> None:
     line_of = [sys.executable, "-m", "salient.experiments.ablation", "--only", "torque_offset", "--runs", "3", "--out",
                str(tmp_path)]

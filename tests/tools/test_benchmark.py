@@ -21,6 +21,8 @@ from salient.machine.file import load_machine
 from salient.paths import BUILD, MACHINES, ROOT
 from salient.reference.scipy_plant import dop853, run_scipy
 
+pytestmark = pytest.mark.in_turns
+
 PERIODS = 800  # 20 ms, two and a half strokes
 
 

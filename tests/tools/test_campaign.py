@@ -29,6 +29,7 @@ def salient(*arguments: object) -> subprocess.CompletedProcess[str]:
                           check=False)
 
 
+@pytest.mark.in_turns
 def test_shards_merge_to_what_one_run_has_and_nothing_runs_twice(tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     common = ["campaign", "--first", "2", "--seeds", "6", "--no-shrink", "--jobs", "1", "--out"]
@@ -50,6 +51,7 @@ def test_shards_merge_to_what_one_run_has_and_nothing_runs_twice(tmp_path: Path)
     assert len(note["cells_not_reached"]) == note["cells"] - note["cells_reached"]
 
 
+@pytest.mark.in_turns
 def test_a_scheduler_whose_worker_is_killed_has_the_summary_of_one_computer_byte_for_byte(tmp_path: Path) -> None:
     note = compare(tmp_path, 50, 60)
     assert note["killed"] and note["equal"] and 20 <= note["killed_after"] < 60
@@ -97,6 +99,7 @@ def test_leaving_an_event_out_moves_no_other() -> None:
     assert run_world(3, kept)["hash"] != run_world(3)["hash"] == run_world(3)["hash"]
 
 
+@pytest.mark.in_turns
 def test_seeds_differ_in_machine_controller_and_events() -> None:
     worlds = [world(seed) for seed in range(1, 41)]
     assert len(files()) == 20
@@ -107,6 +110,7 @@ def test_seeds_differ_in_machine_controller_and_events() -> None:
     assert min(numbers) <= 1 and 4 <= max(numbers) <= 6 and 2.0 < sum(numbers) / len(numbers) < 5.0
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("seed", [6, 43, 819])
 def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) -> None:
     again = replay(seed, folder=tmp_path)
@@ -116,6 +120,7 @@ def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) 
     assert json.loads((tmp_path / "bench.json").read_text())["replay"] == f"tools/salient replay {seed}"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("seed", [13, 19, 39, 87, 1584])
 def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
     result = run_world(seed, healthy=True)
@@ -123,6 +128,7 @@ def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
     assert 300_000 < result["virtual_us"] < 4_000_000
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("seed", "event", "cause"), [
     (8053769, "switch_shorted", 17),  # phase_shorted
     (8051023, "encoder_slip", 18),    # encoder_angle
@@ -142,6 +148,7 @@ def test_a_rotor_that_swings_with_a_phase_lost_is_stalled(seed: int) -> None:
     assert result["causes"] == [14] and result["violations"] == []
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("seed", "event"), [
     (10824, "static_friction"), (20918, "shaft_locked"), (72251, "shaft_locked"), (90244, "shaft_locked")])
 def test_a_rotor_that_rests_between_coarse_counts_is_stalled_in_time(seed: int, event: str) -> None:
@@ -233,6 +240,7 @@ def test_a_crash_is_replayed_as_one(tmp_path: Path) -> None:
     assert len(only_there.hash) == 16 and not only_there.equal
 
 
+@pytest.mark.in_turns
 def test_a_part_of_the_clients_commands_a_torque_for_some_time() -> None:
     torque_mode = [drawn for drawn in map(world, range(1, 31))
                    if any(event["event"] == "torque_reference" for event in drawn["events"])]
@@ -244,6 +252,7 @@ def test_a_part_of_the_clients_commands_a_torque_for_some_time() -> None:
     assert sum(one["hash"] != other["hash"] for one, other in zip(results, without, strict=True)) > len(results) // 2
 
 
+@pytest.mark.in_turns
 def test_a_seed_has_the_same_bits_twice_on_the_bench_and_on_a_target(tmp_path: Path,
                                                                      capsys: pytest.CaptureFixture[str]) -> None:
     assert same_bits.main([str(tmp_path), "401", "2"]) == 0
@@ -270,6 +279,7 @@ NOT_FAULTY = {"load_dropped", "winding_temperature_sensor_offset", "inverter_tem
 """Faults that change nothing which a drive should answer."""
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("setting", "places", "unanswered"), [
     ((2, 150, 8, 0, 2000, 200), 10, {"static_friction"}),  # a shaft that turns does not stick
     ((2, 1500, 6, 0, 200, 20), 10, {"static_friction"}),
@@ -292,6 +302,7 @@ def test_every_fault_is_answered_wherever_it_begins(setting: tuple[int, ...], pl
     assert 0.5 * period_us < longest_us["switch_open", 0] < 1.5 * period_us
 
 
+@pytest.mark.in_turns
 def test_a_branch_at_one_place_is_the_one_among_others() -> None:
     alone, first = ({row["fault"]: row for row in branches(2, 1500, 6, 60, ticks, 20)} for ticks in (1, 40))
     assert all(row["branches"] == 1 and row["detected"] <= 1 for row in alone.values())

@@ -16,6 +16,7 @@ from salient.experiments.campaign.known import Known
 from salient.experiments.campaign.runner import run_world
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("entry", known.known(), ids=lambda entry: f"{entry.seed}-{entry.violation}")
 def test_a_known_deviation_is_still_there_and_has_a_reason(entry: Known) -> None:
     found = classes(run_world(entry.seed, healthy=entry.healthy))

@@ -135,6 +135,7 @@ class CountingListener(can.Listener):
         self.errors.append(exc)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("cause", ["drive", "client"])
 def test_listener_that_handles_the_end_is_not_called_without_pause(connect, monkeypatch, cause):
     """One call, and one more per timeout of the Notifier: 1 s. The test holds each pause until it has looked."""

@@ -24,6 +24,7 @@ def test_of_many_the_nearest_three_are_named():
     assert close_names("x", map(str, range(100, 250))).count(", ") == 2
 
 
+@pytest.mark.in_turns
 def test_every_name_with_a_letter_lost_doubled_or_exchanged_is_among_the_nearest():
     for name in PARAMETERS:
         for at in range(len(name) - 1):

@@ -109,6 +109,7 @@ def random_frames(codec: Codec) -> list[tuple[Message, dict[str, int | float]]]:
     return frames
 
 
+@pytest.mark.in_turns
 def test_c_unpacks_frames_packed_by_python(codec: Codec) -> None:
     for message, values in random_frames(codec):
         structure = codec.unpack(message, message.encode(values, scaling=False))
@@ -116,6 +117,7 @@ def test_c_unpacks_frames_packed_by_python(codec: Codec) -> None:
             assert getattr(structure, camel_to_snake_case(name)) == raw, f"{message.name}.{name}, seed {SEED}"
 
 
+@pytest.mark.in_turns
 def test_python_unpacks_frames_packed_by_c(codec: Codec) -> None:
     for message, values in random_frames(codec):
         structure = codec.structures[message.name]()
@@ -283,6 +285,7 @@ def telemetry(tmp_path_factory: pytest.TempPathFactory) -> Telemetry:
     return Telemetry(tmp_path_factory.mktemp("telemetry"))
 
 
+@pytest.mark.in_turns
 def test_telemetry_is_packed_with_saturation(telemetry: Telemetry) -> None:
     rng = random.Random(SEED)
     for message in telemetry.messages:

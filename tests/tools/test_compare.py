@@ -306,6 +306,7 @@ def held(torque_Nm, current_A, request_Nm, speed_rpm=2250.0, **bench):
     return EXTRACTORS["held"](scenario, recording), EXTRACTORS["held_part"](scenario, recording)
 
 
+@pytest.mark.in_turns
 def test_held_torque_is_judged_by_its_bound_and_the_current_by_its_limit():
     motoring, part = held(np.linspace(20.0, 24.0, 101), np.linspace(0.0, 53.0, 101), 40.0)
     assert motoring["torque_bound_Nm"] == pytest.approx(25.9, rel=0.01)
@@ -361,6 +362,7 @@ def test_drop_above_base_speed_is_relative_to_that_below():
 
 # --- scenarios ------------------------------------------------------------------------------------------------------
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("group", GROUPS)
 def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
     for case in ALL_CASES[group][:: max(1, len(ALL_CASES[group]) // 20)]:
@@ -692,6 +694,7 @@ def test_missing_event_and_fault_are_worse_than_any_value():
     assert change_of("none", "none", before_failed="fault", now_failed="fault") is None
 
 
+@pytest.mark.in_turns
 def test_same_drive_has_no_change_and_a_modified_baseline_is_detected(start_folder, tmp_path):
     folder, _ = start_folder
     code, output = compare("start", "--quick", "--jobs", 1, "--out", tmp_path / "again", "--baseline", folder)
@@ -751,6 +754,7 @@ def test_metrics_of_a_start_are_those_of_the_drive(start_folder):
     assert [run["controller"] for run in content["runs"]] == list(CONTROLLERS)
 
 
+@pytest.mark.in_turns
 def test_page_is_complete_and_self_contained(tmp_path):
     # One plot of each kind, from short runs.
     code, output = compare("ripple", "speeds", "--quick", "--out", tmp_path)
@@ -769,6 +773,7 @@ def test_page_is_complete_and_self_contained(tmp_path):
     assert np.ptp(torque_Nm) / 8.314 == pytest.approx(ripple["saturating, 40 kHz, one pulse"]["paper"], rel=0.01)
 
 
+@pytest.mark.in_turns
 def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
     code, output = compare("dip", "robustness", "--quick", "--out", tmp_path)
     assert code == 0
@@ -787,6 +792,7 @@ def test_studies_have_plots_and_quick_targets_are_not_judged(tmp_path):
     assert 40.0 < values["robustness", "peak_current_A", "worst"]["paper"] < 90.0
 
 
+@pytest.mark.in_turns
 def test_drive_follows_moving_loads(tmp_path):
     code, output = compare("moving", "ramps", "--quick", "--out", tmp_path)
     assert code == 0 and "6 of 6 targets reached" in output
@@ -799,6 +805,7 @@ def test_drive_follows_moving_loads(tmp_path):
         assert low_rpm < values[condition][controller] < high_rpm
 
 
+@pytest.mark.in_turns
 def test_ranges_have_figures_and_plots(tmp_path):
     code, output = compare("inertia", "rates", "encoders", "misalignment", "standing_error", "hold", "--quick",
                            "--out", tmp_path)

@@ -49,6 +49,7 @@ def bytes_by_name(folder):
             for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "output.txt"}
 
 
+@pytest.mark.in_turns
 def test_all_documented_files_exist(demo_folder):
     runs = [f"runs/{experiment}_{controller}/{name}" for experiment in demo.EXPERIMENTS for controller in CONTROLLERS
             for name in ("can.blf", "can.log", "recording.npy")]
@@ -87,6 +88,7 @@ def test_output_lists_each_step_and_ends_with_the_metrics(demo_folder):
     assert output.endswith(f"report:  {demo_folder / 'report.html'}\n")
 
 
+@pytest.mark.in_turns
 def test_equal_runs_are_equal_to_the_byte(demo_folder, tmp_path):
     demo.run(options("--out", tmp_path), stream=io.StringIO())
     assert bytes_by_name(tmp_path) == bytes_by_name(demo_folder)
@@ -116,6 +118,7 @@ def test_steady_torque_is_load_plus_friction(demo_metrics, controller):
         (values["torque_max_Nm"] - values["torque_min_Nm"]) / values["torque_mean_Nm"], rel=3e-4)  # of six digits
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controllers", [("paper",), ("paper", "traditional")])
 def test_scenario_files_select_the_controllers(controllers, tmp_path, monkeypatch):
     for experiment in demo.EXPERIMENTS:
@@ -181,6 +184,7 @@ def test_picture_of_the_readme_is_that_of_the_demo(demo_folder):
 
 # Settling times of the paper's controller follow from T_max over inertia, which is small in the finite-element machine:
 # 62.8 rad/s * 0.00401 kg m^2 / 19.1 N m is 0.0132 s.
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "settles_s"), [("linear_cosine", (0.0673, 0.072)),
                                                     ("linear_trapezoid", (0.0673, 0.072)),
                                                     ("finite_element", (0.0132, 0.024))])

@@ -166,6 +166,7 @@ def test_every_formula_is_documented():
                 assert each.formula in text or each.name.endswith("_rated_Nm"), each.name
 
 
+@pytest.mark.in_turns
 def test_machine_command_lists_values_with_formula_and_source(salient, tmp_path):
     result = salient("machine", OTHERS[0], "--out", tmp_path, "--json", tmp_path / "drive.json")
     assert result.returncode == 0, result.stderr

@@ -42,6 +42,7 @@ def test_read_telemetry_waits_for_the_drive_and_prints_decoded_frames(channel):
     assert any(" DRIVE_MOTION {'speed_rpm': 0.0" in line for line in lines)
 
 
+@pytest.mark.in_turns
 def test_run_600_rpm_runs_the_drive_and_stops_it(channel):
     telemetry = SignalTable(drive_database(), "DRIVE")
     # One tenth of real time: the time-out of commands leaves a wide margin for a loaded computer.
@@ -81,6 +82,7 @@ def test_c_example_compiles_without_a_warning_and_names_the_interface_that_is_mi
         assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("script", ["read_telemetry.py", "run_600_rpm.py"])
 def test_end_of_the_drive_is_reported_in_one_line(channel, script):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
@@ -97,12 +99,14 @@ def run(folder, *command, **environment):
                           capture_output=True)
 
 
+@pytest.mark.in_turns
 def test_first_test_passes(tmp_path):
     shutil.copy(EXAMPLES / "test_first.py", tmp_path)
     done = run(tmp_path, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", ".")
     assert (done.returncode, "1 passed" in done.stdout) == (0, True), done.stdout
 
 
+@pytest.mark.in_turns
 def test_torque_loop_holds_the_speed(tmp_path):
     done = run(tmp_path, sys.executable, EXAMPLES / "torque_loop.py")
     assert (done.returncode, done.stderr) == (0, "")
@@ -119,6 +123,7 @@ def test_log_is_analysed_with_pandas(tmp_path):
     assert last[0] == "0.2" and abs(float(last[2])) < 0.5 and int(last[1]) > 50
 
 
+@pytest.mark.in_turns
 def test_sweep_writes_its_table(tmp_path):
     done = run(tmp_path, EXAMPLES / "sweep.sh", "--shard", "1/15", SALIENT=f"{sys.executable} -m salient")
     assert done.returncode == 0, done.stderr

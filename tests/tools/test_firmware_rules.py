@@ -60,6 +60,7 @@ def symbol_check(tmp_path: Path, compiler: str, source: str) -> subprocess.Compl
     )
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(
     ("compiler", "source", "symbol"),
     [

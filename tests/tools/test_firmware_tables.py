@@ -167,6 +167,7 @@ class Structured:
         return 0.5 * slope_H * np.asarray(current_A) ** 2
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("first", "last", "points"), [
     (0.3, 0.3 + 0.9 / ANGLE_BINS, 12), (0.5, 0.5 + 1.0 / ANGLE_BINS, 3), (0.3, 0.35, 40), (0.1, 0.2, 30),
     (0.0, 1.0, 12), (0.0, 1.0, 400), (0.9, 1.0, 60), (0.0, 0.02, 25),

@@ -19,6 +19,8 @@ from salient.__main__ import main
 from salient.cli import CLONE_ONLY
 from salient.paths import BUILD, ROOT
 
+pytestmark = pytest.mark.in_turns
+
 FOREIGN = ROOT / "tests" / "tools" / "foreign"
 SYSTEM = "/usr/local/bin:/usr/bin:/bin"
 

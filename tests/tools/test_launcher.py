@@ -35,6 +35,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
         assert expected in result.stderr
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(
     ("arguments", "expected_texts"),
     [

@@ -32,6 +32,7 @@ def test_python_can_as_it_is_loads_both():
     assert output_of("") == "asammdf pandas True MDF"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("generator", ["codec", "bench_variables", "fault_kinds", "fmu"])
 def test_generators_do_not_load_it(generator):
     assert output_of(f"import salient.generate.{generator}") == "True MDF"

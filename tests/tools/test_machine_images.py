@@ -81,6 +81,7 @@ def test_a_value_that_its_type_cannot_hold_is_an_error():
 
 # --- the cache ------------------------------------------------------------------------------------------------------
 
+@pytest.mark.in_turns
 def test_image_is_made_once_and_again_when_file_or_map_change(empty_cache: Path, tmp_path: Path):
     path = write_machine(tmp_path, "mapped", csv_text(rows(formula("saturating"), range(0, 46, 5), range(10, 101, 10))))
     first = machine_image(str(path))
@@ -106,6 +107,7 @@ def test_image_is_made_once_and_again_when_file_or_map_change(empty_cache: Path,
     assert machine_image(str(path)) == first
 
 
+@pytest.mark.in_turns
 def test_c_sources_and_image_are_made_once_for_all_and_again_when_the_file_changes(empty_cache, tmp_path, monkeypatch):
     path = variation(tmp_path, "compiled")
     runs = []
@@ -131,6 +133,7 @@ def test_c_sources_and_image_are_made_once_for_all_and_again_when_the_file_chang
     assert len(runs) == 2 and (tmp_path / "host" / names[0]).read_bytes() != host[0]
 
 
+@pytest.mark.in_turns
 def test_image_of_a_file_that_changes_meanwhile_is_that_of_its_content(empty_cache, tmp_path, monkeypatch):
     path = variation(tmp_path, "changing")
     before = path.read_text(encoding="utf-8")
@@ -193,6 +196,7 @@ def result_of(process: subprocess.Popen[str]) -> list:
     return json.loads(output)
 
 
+@pytest.mark.in_turns
 def test_16_processes_start_8_machines_at_once_from_an_empty_cache(tmp_path: Path):
     inertia = "inertia_kg_m2 = 0.02"
     files: list[str | Path] = [

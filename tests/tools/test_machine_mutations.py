@@ -292,6 +292,7 @@ def test_unmutated_files_are_valid_machines(tmp_path: Path) -> None:
     assert rejection(write(tmp_path, MAP_MACHINE, GOOD_MAP)) is None
 
 
+@pytest.mark.in_turns
 def test_every_mutation_of_a_key_or_table_is_rejected_by_one_line_that_names_it(tmp_path: Path) -> None:
     assert len(MACHINE_CASES) > 600
     messages = {what: (rejection(write(tmp_path, text)), named) for what, text, named in MACHINE_CASES}
@@ -394,6 +395,7 @@ def test_contradictory_data_of_the_drive_are_refused_by_a_line_that_names_both(
     assert text is not None and text.startswith(first) and second in text, text
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("map_file", [False, True], ids=["formula", "map"])
 def test_random_data_of_the_drive_are_refused_by_a_line_that_names_one_or_give_finite_values(
         tmp_path: Path, map_file: bool) -> None:
@@ -433,6 +435,7 @@ def test_truncated_machine_file_is_rejected_or_still_valid(tmp_path: Path) -> No
     assert sum(text is not None for text in messages) > needed
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("good", [GOOD, MAP_MACHINE], ids=["formula", "map"])
 def test_machine_file_with_flipped_bytes_is_rejected_or_still_valid(tmp_path: Path, good: str) -> None:
     chance = random.Random(SEED)
@@ -676,6 +679,7 @@ def still_runs(words: str) -> bool:
     return False
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("case", COMMAND_CASES)
 def test_commands_end_with_one_line_and_exit_code_2_and_build_nothing(
     salient: Callable, tmp_path: Path, case: str

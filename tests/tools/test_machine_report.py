@@ -29,6 +29,7 @@ def test_reference_lists_exactly_the_bundled_machines():
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == {path.stem for path in MACHINES.glob("*.toml")}
 
 
+@pytest.mark.in_turns
 def test_bundled_machine_is_described_and_plotted(salient, tmp_path):
     result = salient("machine", "saturating", "--out", tmp_path / "view")
     assert result.returncode == 0, result.stderr
@@ -53,6 +54,7 @@ def test_converter_and_sensors_of_a_file_are_described():
         assert ("converter   ideal" in text) == (len(data["converter"]) == 1)
 
 
+@pytest.mark.in_turns
 def test_invalid_file_is_one_line_and_exit_code_2(salient, tmp_path):
     wrong = tmp_path / "wrong.toml"
     wrong.write_text((MACHINES / "saturating.toml").read_text().replace("stator = 6", "stator = 5"))

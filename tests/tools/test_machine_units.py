@@ -130,6 +130,7 @@ def in_no_unit(machine: Machine, scaling: Scaling) -> str:
     return re.sub(r"\.(parameter_fraction_bits|dbc_hash) = [^.]*", "", source)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("name", ["saturating", "linear_cosine", "linear_trapezoid"])
 def test_similar_machines_have_the_same_firmware_to_the_bit(name):
     path = MACHINES / f"{name}.toml"

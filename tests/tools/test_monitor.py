@@ -132,6 +132,7 @@ def test_node_without_a_drive_is_told_once_with_the_nodes_that_are_heard(listen)
     assert finish(process) == ("", "", 1)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("end", ["duration", "interrupt", "bus"])
 def test_node_that_was_never_heard_is_exit_code_1(listen, end):
     process = listen("monitor", "--node", "2", "--signals", "DRIVE_STATUS.state", "--duration-s", "0.5",

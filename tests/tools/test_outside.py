@@ -36,6 +36,7 @@ def assert_one_line(errors: str, *texts: str) -> None:
     assert all(text in errors for text in texts), errors
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".mf4"])
 def test_full_disk_ends_a_log_with_one_line(make_bench: Callable, full_disk: Path, suffix: str) -> None:
     bench, path = make_bench(), full_disk / f"can{suffix}"
@@ -49,6 +50,7 @@ def test_full_disk_ends_a_log_with_one_line(make_bench: Callable, full_disk: Pat
     assert_one_line(errors, str(path), "No space left on device")
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("arguments", [
     ("machine", "saturating", "--out"), ("machine", "saturating", "--out", "machine", "--dbc"),
     ("run", "start_600", "--out"),

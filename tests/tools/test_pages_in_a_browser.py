@@ -41,6 +41,7 @@ PAGES = {
 }
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("name", PAGES)
 def test_nothing_is_cut_off_or_covered(unreadable, tmp_path, name, width):

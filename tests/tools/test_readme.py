@@ -63,6 +63,7 @@ def test_main_readme_has_commands_and_starts_a_drive() -> None:
     assert any("tools/salient sim" in block and BUS in block for block in blocks)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("command", "exit_code"), [
     ("ctest --test-dir build/host -R test_control_speed_smc --output-on-failure", 0),
     ("ctest --test-dir build/host -R none_of_this_name", 1),
@@ -76,6 +77,7 @@ def test_a_selection_is_listed_and_must_not_be_empty(command: str, exit_code: in
     assert "Passed" not in result.stdout and " passed" not in result.stdout
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("blocks", CASES)
 def test_commands_of_a_section_succeed(tmp_path: Path, blocks: list[str]) -> None:
     simulators: list[subprocess.Popen[str]] = []

@@ -154,11 +154,13 @@ def test_colours_of_controllers_are_distinguishable_with_any_colour_vision(eyes)
         assert 20.0 < np.linalg.norm(lab(colours[0], eyes) - lab(colours[1], eyes)) < 150.0, (one, other)
 
 
+@pytest.mark.in_turns
 def test_equal_runs_give_equal_plots(runs, content, plot_files, tmp_path):
     for first, again in zip(plot_files, plot_all(tmp_path / "again", runs, content), strict=True):
         assert first.read_bytes() == again.read_bytes(), first.name
 
 
+@pytest.mark.in_turns
 def test_run_without_settling_and_recovery_is_plotted(runs, content, tmp_path):
     ours = json.loads(json.dumps(content["experiments"]))
     for controller in CONTROLLERS:
@@ -255,6 +257,7 @@ def of_controllers(content, controllers):
                           for experiment, of in content[part].items()} for part in ("experiments", "losses")}
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("controllers", [("traditional",), ("salient",), ("paper", "salient"),
                                          ("salient", "traditional", "paper")])
 def test_page_and_plots_accept_any_controllers_in_any_order(runs, content, controllers, tmp_path):
@@ -315,6 +318,7 @@ def test_equal_results_give_equal_pages(content, plot_files, tmp_path):
     assert page(tmp_path / "a.html", content, plot_files) == page(tmp_path / "b.html", content, plot_files)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("width", [1280, 390])
 def test_nothing_of_the_page_is_cut_off_or_covered(unreadable, tmp_path, content, plot_files, width):
     page(tmp_path / "report.html", content, plot_files, [("the figures", [("results.json", "results.json")])])

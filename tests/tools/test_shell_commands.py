@@ -69,6 +69,7 @@ def shell(tmp_path):
             process.communicate()
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("arguments", "running", "speed_rpm"), [
     (("speed", "600"), "running: speed 600 r/min, for 0.5 s", 600.0),
     (("speed", "-300"), "running: speed -300 r/min, for 0.5 s", -300.0),
@@ -83,6 +84,7 @@ def test_drive_runs_for_the_duration_and_is_stopped(shell, arguments, running, s
     assert shell.state() == ("ready", "none")
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupt_stops_the_drive(shell, number):
     process = shell.start("speed", "300", first_line="running: speed 300 r/min, until Ctrl-C")
@@ -94,6 +96,7 @@ def test_interrupt_stops_the_drive(shell, number):
     assert shell.state() == ("ready", "none")
 
 
+@pytest.mark.in_turns
 def test_stop_takes_the_place_of_the_command_that_runs_the_drive(shell):
     running = shell.start("speed", "300", first_line="running: speed 300 r/min, until Ctrl-C")
     for refused in (("speed", "200"), ("torque", "1"), ("clear",), ("arm",)):
@@ -109,6 +112,7 @@ def test_stop_takes_the_place_of_the_command_that_runs_the_drive(shell):
     assert shell("stop") == ("the drive does not run: state ready\n", "", 0)
 
 
+@pytest.mark.in_turns
 def test_command_that_is_killed_leaves_a_fault_that_clear_clears(shell):
     process = shell.start("speed", "300", first_line="running: speed 300 r/min, until Ctrl-C")
     process.kill()
@@ -129,6 +133,7 @@ def test_output_that_nobody_reads_stops_the_drive(shell):
     assert shell.state() == ("ready", "none")
 
 
+@pytest.mark.in_turns
 def test_load_acts_on_the_shaft_and_a_bus_without_its_bench_is_named(shell):
     assert shell("load", "3") == ("load 3 N m\n", "", 0)
     _, rig = shell.signals()
@@ -146,6 +151,7 @@ def test_arm_shows_challenge_and_response(shell):
     assert shell.state() == ("ready", "none")
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "reference", "limits"), [
     ("saturating", ("speed", "9000"), "-3000 to 3000 r/min"), ("saturating", ("torque", "-200"), "-128 to 128 N m"),
     ("fan12", ("torque", "0.6"), "-0.5 to 0.5 N m"), ("traction", ("speed", "2900"), "-2852.84 to 2852.84 r/min")])

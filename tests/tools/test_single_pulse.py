@@ -137,6 +137,7 @@ def test_torques_are_those_of_the_pulse(name: str, point: int):
     assert of.peak_Nm[:, point] == pytest.approx(np.maximum(found.largest_Nm, -found.least_Nm), rel=0.02)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("name", COMPARED)
 @pytest.mark.parametrize("point", [3, 8, 12, 16])
 @pytest.mark.parametrize("half", [0, 1], ids=["motoring", "braking"])
@@ -153,6 +154,7 @@ def test_no_pair_of_angles_makes_more_torque_and_none_as_much_with_less_current(
     assert found.rms_A[half] > 0.95 * others.rms_A[torque_Nm.argmax()]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("name", COMPARED)
 @pytest.mark.parametrize("point", [2, 6, 10, 15])
 def test_smooth_torque_is_the_largest_minimum_without_lead(name: str, point: int):
@@ -218,6 +220,7 @@ def parts(name: str) -> PartialPulse:
     return partial_pulse(machine, derive(machine), pulses(name), sharing_window(machine, derive(machine)))
 
 
+@pytest.mark.in_turns
 def test_voltage_makes_each_part_of_the_torque_between_its_angles_whose_reference_is_raised():
     """The reference takes away what is too much. Where it is not raised, it shapes the current instead."""
     compared = 0
@@ -236,6 +239,7 @@ def test_voltage_makes_each_part_of_the_torque_between_its_angles_whose_referenc
     assert compared >= 15
 
 
+@pytest.mark.in_turns
 def test_a_saturating_machine_makes_parts_by_smooth_torque_and_one_with_a_sine_of_the_angle_by_narrower_pulses():
     for name, narrow, raised in (("saturating", False, 0.01), ("linear_cosine", True, 0.2)):
         of = pulses(name)
@@ -258,6 +262,7 @@ def every_machine(folder: Path) -> list[Path]:
     return [*FILES, *files]
 
 
+@pytest.mark.in_turns
 def test_pulses_of_every_machine_are_in_order_and_good_between_the_points(tmp_path: Path):
     for path in every_machine(tmp_path):
         machine = load_machine(path)
@@ -293,6 +298,7 @@ def test_pulses_of_every_machine_are_in_order_and_good_between_the_points(tmp_pa
             assert np.all(found.end_deg < BEGIN_DEG - lead_deg + 360.0), (context, point)
 
 
+@pytest.mark.in_turns
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("change", [
     {"resistance_ohm": 40.0},
@@ -325,6 +331,7 @@ def index_q8(tables: PulseTables, exponents: Exponents, speed_rad_s: float, volt
     return ((speed_q22 * tables.index_scale) >> 32) // voltage_q6
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_tables_are_the_pulses_in_the_units_of_the_machine(path: Path):
     machine = load_machine(path)
@@ -352,6 +359,7 @@ def test_tables_are_the_pulses_in_the_units_of_the_machine(path: Path):
     assert tables.braking_flux * lsb_Wb == pytest.approx(of.braking_flux_Wb, abs=0.501 * lsb_Wb)
 
 
+@pytest.mark.in_turns
 def test_index_of_a_machine_that_is_slow_for_its_voltage_fits(tmp_path: Path):
     """Its points are further apart than its speeds are."""
     text = (MACHINES / "saturating.toml").read_text()

@@ -19,6 +19,8 @@ from salient.bench.failure import plot_moment
 from salient.bench.stimulus import Stimulus, last_before, stimuli, stimuli_of
 from salient.bus.signals import drive_database
 
+pytestmark = pytest.mark.in_turns
+
 STIMULI = {
     "speed": ("bench.drive.speed_reference_rpm = 430", "run in speed mode, speed_reference_rpm = 430 r/min"),
     "reversal": ("bench.drive.speed_reference_rpm = -250", "run in speed mode, speed_reference_rpm = -250 r/min"),

@@ -17,6 +17,8 @@ import pytest
 from salient.bench.failure import LEFT, changes, save
 from salient.experiments.compare.every_machine import EXAMPLES
 
+pytestmark = pytest.mark.in_turns
+
 SUITE = '''
 import os, signal
 import pytest

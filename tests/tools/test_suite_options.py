@@ -59,6 +59,7 @@ def outcome(lines: list[str], word: str) -> set[str]:
     return {line.split("::")[1].split()[0] for line in lines if "::" in line and f" {word}" in line}
 
 
+@pytest.mark.in_turns
 def test_tests_run_once_for_each_machine_and_controller(tmp_path):
     lines = run(tmp_path, "--salient-controller=paper", "--salient-controller=salient")
     assert outcome(lines, "PASSED") == {
@@ -68,6 +69,7 @@ def test_tests_run_once_for_each_machine_and_controller(tmp_path):
           for controller in ("paper", "salient"))}
 
 
+@pytest.mark.in_turns
 def test_drive_alone_on_its_bus_runs_what_does_not_need_the_bench(tmp_path):
     address = f"unix:{tmp_path}/drive.sock"
     with EmulatorProcess(BenchConfig(pace="x0.5", drive_only=True), address):
@@ -80,6 +82,7 @@ def test_drive_alone_on_its_bus_runs_what_does_not_need_the_bench(tmp_path):
         assert f"needs the test bench ({what}), and on {address} there is a drive alone" in reasons
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("option", "error"), [
     ("--salient-program=nowhere", "--salient-program nowhere: must be an executable file"),
     ("--salient-controller=pid", "invalid choice: 'pid'"),

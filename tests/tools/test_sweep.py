@@ -52,6 +52,7 @@ def rows(out: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.in_turns
 def test_sweep_gives_the_same_table_on_processes_shards_and_a_scheduler_whose_worker_is_killed(
         scenario, tmp_path, dask_cluster):
     assert sweep.run(options(scenario, tmp_path / "a", *SWEPT, "--jobs", "2"), io.StringIO()) == 0
@@ -89,6 +90,7 @@ def test_sweep_gives_the_same_table_on_processes_shards_and_a_scheduler_whose_wo
     assert len(read_results(tmp_path / "c")) == 20
 
 
+@pytest.mark.in_turns
 def test_finished_runs_are_kept_for_the_same_scenario_only(scenario, tmp_path, monkeypatch):
     out = tmp_path / "out"
     arguments = (scenario, out, "--set", "torque_max_Nm=10,12", "--resume", "--jobs", "1")
@@ -102,6 +104,7 @@ def test_finished_runs_are_kept_for_the_same_scenario_only(scenario, tmp_path, m
     assert len(read_results(out)) == 4
 
 
+@pytest.mark.in_turns
 def test_without_resume_the_runs_of_other_shards_stay(scenario, tmp_path):
     arguments = (scenario, tmp_path / "out", "--set", "torque_max_Nm=10,12", "--jobs", "1")
     sweep.run(options(*arguments, "--shard", "1/2"), io.StringIO())
@@ -117,6 +120,7 @@ def test_the_first_seed_may_be_0(scenario, tmp_path):
     assert [of.columns["seed"] for of in found] == [0, 1] == [of.scenario.seed for of in found]
 
 
+@pytest.mark.in_turns
 def test_loads_profiles_and_seeds_are_columns(scenario, tmp_path):
     sweep.run(options(scenario, tmp_path, "--load-Nm", "1,3", "--load-profile", "compressor_one_cylinder", "--seeds",
                       "2", "--set", "current_noise_A=0.05", "--controller", "paper"), io.StringIO())
@@ -126,6 +130,7 @@ def test_loads_profiles_and_seeds_are_columns(scenario, tmp_path):
     assert len({row["mean_torque_Nm"] for row in found}) == 4  # noise by seed, torque by load
 
 
+@pytest.mark.in_turns
 def test_failed_run_is_a_row_and_the_exit_code(scenario, tmp_path, capsys):
     code = sweep.run(options(scenario, tmp_path, "--set", "encoder_fault=0,1"), io.StringIO())
     assert code == 1
@@ -163,6 +168,7 @@ def compared(out: Path, *arguments: str) -> dict[str, object]:
     return json.loads((out / "compare.json").read_text())
 
 
+@pytest.mark.in_turns
 def test_compare_runs_with_a_setting_and_on_a_scheduler(tmp_path, dask_cluster):
     plain = compared(tmp_path / "plain", "--jobs", "2")
     assert compared(tmp_path / "dask", "--scheduler", dask_cluster.address)["rows"] == plain["rows"]

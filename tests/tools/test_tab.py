@@ -59,6 +59,7 @@ def test_one_file_of_at_most_310_kB_packed_that_refers_to_nothing_outside(tab):
     assert not re.search(r"\b(fetch|WebSocket|XMLHttpRequest|importScripts)\(", text)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["saturating", "finite_element"])
 def test_client_of_the_page_sends_and_receives_the_frames_of_the_tools(tab, make_bench, machine):
     """Arming, checksums, counters, sets of parameters, variables of the bench and faults, refused ones included: every
@@ -144,6 +145,7 @@ def test_values_of_parameters_are_set_linked_and_refused_by_their_names(tab):
     assert again["same"] == [[made["time_ns"], True]]
 
 
+@pytest.mark.in_turns
 def test_rewound_run_repeats_to_the_bit_and_another_branch_differs(tab):
     begin = [to(20), command("speed_reference", rpm=300), to(400), command("load_torque", Nm=4), to(700),
              command("fault", kind="current_sensor_gain", phase="a", value=1.1), to(800)]
@@ -161,6 +163,7 @@ def test_rewound_run_repeats_to_the_bit_and_another_branch_differs(tab):
     assert again == once * 2
 
 
+@pytest.mark.in_turns
 def test_rewinding_reaches_ten_seconds_back_and_no_further(tab):
     made, = run_in_tab(tab, {"options": {"telemetry_period_ms": 10}, "steps": [
         to(20), command("truth_period", us=100_000), to(12_000), {"back_ns": 0}, to(12_000)]})
@@ -171,6 +174,7 @@ def test_rewinding_reaches_ten_seconds_back_and_no_further(tab):
     assert 300_000 < made["memory_bytes"] < 2_000_000
 
 
+@pytest.mark.in_turns
 def test_link_repeats_the_run_to_the_bit_and_the_hash_notices_another(tab):
     made, = run_in_tab(tab, {"machine": "linear_cosine", "options": {"seed": 7, "controller": "paper"}, "steps": [
         to(20), command("set_parameters", values={"speed_ramp_rpm_s": 9000, "torque_max_Nm": 12}),
@@ -185,6 +189,7 @@ def test_link_repeats_the_run_to_the_bit_and_the_hash_notices_another(tab):
     assert other["same"] == [[500 * MS, False]]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("options", [{}, {"machine": "linear_trapezoid", "controller": "traditional", "seed": 9,
                                           "initial_angle_deg": 12.25, "adc_bits": 14, "encoder_edges": True}])
 def test_link_of_a_failed_test_repeats_every_frame_of_its_bench(tab, make_bench, options):

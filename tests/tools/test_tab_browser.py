@@ -10,6 +10,8 @@ from salient.paths import BUILD
 from salient.tab import file as tab_file
 from salient.tab.build_id import build_id
 
+pytestmark = pytest.mark.in_turns
+
 PICTURES = BUILD / "view"
 BITS = "events=0.02:speed_reference:rpm=300;0.1:load_torque:Nm=3"
 

@@ -99,6 +99,7 @@ def test_tasks_that_always_kill_their_worker_end_the_run(tmp_path):
         list(run(tasks(), die, tmp_path, jobs=2))
 
 
+@pytest.mark.in_turns
 def test_workers_end_with_a_runner_that_is_killed(tmp_path):
     code = ("import sys, time, pathlib\nfrom salient.experiments.tasks import Task, run\n"
             "out = pathlib.Path(sys.argv[1])\n"
@@ -174,6 +175,7 @@ def test_missing_scheduler_is_named(tmp_path):
             results(tmp_path, scheduler=address)
 
 
+@pytest.mark.in_turns
 def test_scheduler_gives_the_same_results_when_a_worker_is_killed(tmp_path, dask_cluster):
     log = tmp_path / "executions"
     log.write_text("")

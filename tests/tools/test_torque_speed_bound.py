@@ -50,6 +50,7 @@ def test_pulse_of_a_linear_machine_has_the_flux_linkage_of_its_volt_seconds():
     assert pulse.peak_A == pytest.approx(current_A.max(), rel=2e-3)
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("speed_rpm", "angles_deg"), [
     (500.0, (180.0, 350.0)), (3000.0, (160.0, 330.0)), (4000.0, (153.0, 345.0)), (1500.0, (330.0, 535.0))])
 def test_energy_from_the_link_is_work_and_losses(speed_rpm, angles_deg):
@@ -59,6 +60,7 @@ def test_energy_from_the_link_is_work_and_losses(speed_rpm, angles_deg):
     assert pulse.link_W == pytest.approx(mechanical_W + pulse.copper_W + pulse.device_W, rel=1e-3)
 
 
+@pytest.mark.in_turns
 def test_link_sags_by_the_source_resistance_when_motoring_and_stands_at_the_chopper_when_braking():
     machine = machine_of("finite_element")
     motoring = operate(machine, 3000.0, OF_SUPPLY, 160.0, 330.0)
@@ -82,6 +84,7 @@ def test_current_that_rises_above_its_limit_against_the_full_voltage_is_refused(
     assert operate(ideal("linear_cosine"), 4000.0, OF_SUPPLY, 250.0, 420.0).torque_Nm == 0.0
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("quadrant", [MOTORING, BRAKING])
 def test_largest_torque_of_finite_element_is_that_of_another_implementation(quadrant):
     # The same bound by another program, with 52 A, an ideal supply of 240 V and no drops.
@@ -92,6 +95,7 @@ def test_largest_torque_of_finite_element_is_that_of_another_implementation(quad
         assert 0.99 * torque_Nm < quadrant * pulse.torque_Nm < (1.0 + more) * torque_Nm
 
 
+@pytest.mark.in_turns
 def test_largest_torque_is_below_that_of_the_current_limit_at_every_angle_and_reaches_it_at_low_speed():
     machine = ideal("saturating")
     angle_rad = np.linspace(0.5, 1.0, 2001) * machine.magnetics.pitch_rad
@@ -101,6 +105,7 @@ def test_largest_torque_is_below_that_of_the_current_limit_at_every_angle_and_re
     assert fast.torque_Nm < 0.97 * half_Nm
 
 
+@pytest.mark.in_turns
 def test_largest_torque_rises_with_the_voltage_and_falls_with_the_speed():
     machine = ideal("linear_cosine")
     by_supply = [largest_torque(machine, [1500.0, 2250.0, 3000.0], replace(OF_SUPPLY, supply_V=supply_V), MOTORING)
@@ -114,6 +119,7 @@ def test_largest_torque_rises_with_the_voltage_and_falls_with_the_speed():
     assert fast.torque_Nm == pytest.approx(slow.torque_Nm, rel=1e-6)
 
 
+@pytest.mark.in_turns
 def test_braking_is_limited_by_what_the_chopper_takes_below_the_over_voltage():
     machine = machine_of("finite_element")
     (pulse,) = largest_torque(machine, [3500.0], OF_SUPPLY, BRAKING)
@@ -124,6 +130,7 @@ def test_braking_is_limited_by_what_the_chopper_takes_below_the_over_voltage():
     assert without.torque_Nm < 1.05 * pulse.torque_Nm
 
 
+@pytest.mark.in_turns
 def test_braking_with_the_link_at_its_limit_is_found_whatever_the_limit():
     """Angles that are permitted are few, and a higher voltage returns less energy."""
     machine = machine_of("finite_element")
@@ -137,6 +144,7 @@ def test_braking_with_the_link_at_its_limit_is_found_whatever_the_limit():
     assert 24.5 < torques_Nm[0] < torques_Nm[1] < torques_Nm[2] < 27.5
 
 
+@pytest.mark.in_turns
 def test_link_without_a_chopper_lets_braking_dissipate_only():
     machine = machine_of("finite_element")
     link = {key: value for key, value in machine.dc_link.items() if not key.startswith("chopper")}
@@ -144,6 +152,7 @@ def test_link_without_a_chopper_lets_braking_dissipate_only():
     assert pulse.torque_Nm == 0.0
 
 
+@pytest.mark.in_turns
 def test_pulse_of_least_current_makes_its_torque_and_no_other_pulse_makes_it_with_less():
     machine, speed_rpm = ideal("linear_cosine"), 2250.0
     wanted_Nm = (6.0, 13.0, -13.0)
@@ -159,6 +168,7 @@ def test_pulse_of_least_current_makes_its_torque_and_no_other_pulse_makes_it_wit
                 assert near.rms_A > 0.99 * pulse.rms_A
 
 
+@pytest.mark.in_turns
 def test_pulse_of_least_current_is_found_where_few_angles_are_permitted():
     """Braking, the current of a linear machine rises against the full voltage for most pairs of angles."""
     (pulse,) = least_current(machine_of("linear_cosine"), 2250.0, OF_SUPPLY, [-19.4])
@@ -171,6 +181,7 @@ def test_torque_beyond_the_largest_has_no_pulse():
     assert pulse.torque_Nm == 0.0 and math.isinf(pulse.rms_A)
 
 
+@pytest.mark.in_turns
 def test_rough_torque_is_near_the_largest():
     machine, speeds_rpm = ideal("linear_cosine"), [375.0, 1500.0, 3000.0]
     rough_Nm = rough_torque_Nm(machine, speeds_rpm, OF_SUPPLY)

@@ -74,6 +74,7 @@ def frames_by_message(bench):
                    if not (m.is_remote_frame or m.is_error_frame or m.is_fd))
 
 
+@pytest.mark.in_turns
 def test_twenty_signals_at_1_kHz_for_ten_seconds_without_a_lost_frame(live):
     visitor, bench = live(), live.bench
     visitor.tab("Signals")
@@ -105,6 +106,7 @@ def torque_of_the_loops(visitor):
     return sum(map(float, work_J)) * 4 / (2 * math.pi) / torque_Nm  # four rotor poles
 
 
+@pytest.mark.in_turns
 def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: PLR0915 - one visit, step by step
     visitor, bench, page = live(), live.bench, None
     page = visitor.page
@@ -270,6 +272,7 @@ def test_values_with_names_are_shown_chosen_triggered_and_exported_by_them(live)
     assert {value for row in rows for value in row} <= {"run", "ready", "paper", "salient"}
 
 
+@pytest.mark.in_turns
 def test_cursors_trigger_and_the_part_that_is_dragged(live):
     visitor = live()
     visitor.take_command()
@@ -300,6 +303,7 @@ def test_cursors_trigger_and_the_part_that_is_dragged(live):
     assert visitor.ask("salient.timeline.window_ns") == pytest.approx(0.02e9, rel=0.03)
 
 
+@pytest.mark.in_turns
 def test_a_second_commanding_page_is_refused_with_a_message(live):
     first, second = live(), live()
     first.take_command()
@@ -313,6 +317,7 @@ def test_a_second_commanding_page_is_refused_with_a_message(live):
     second.take_command()
 
 
+@pytest.mark.in_turns
 def test_a_page_that_falls_asleep_lets_the_command_time_out_and_the_drive_stops(live):
     sleeper, watcher, bench = live(), live(), live.bench
     sleeper.take_command()
@@ -329,6 +334,7 @@ def test_a_page_that_falls_asleep_lets_the_command_time_out_and_the_drive_stops(
     assert "this page slept" in sleeper.notice()
 
 
+@pytest.mark.in_turns
 def test_a_page_that_is_closed_lets_the_command_time_out(live):
     closed, watcher, bench = live(), live(), live.bench
     closed.take_command()
@@ -349,6 +355,7 @@ def _origin(link):
     return link.split("/?")[0]
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("wrong", ["origin", "no origin", "token", "no token"])
 def test_neither_a_foreign_origin_nor_a_page_without_the_token_is_served(live, wrong):
     address, origin = _address(live.link), _origin(live.link)
@@ -364,6 +371,7 @@ def test_neither_a_foreign_origin_nor_a_page_without_the_token_is_served(live, w
         assert "info" in json.loads(accepted.recv())
 
 
+@pytest.mark.in_turns
 def test_a_page_of_another_origin_can_neither_command_nor_read_even_with_the_token(browser, live):
     class Foreign(http.server.BaseHTTPRequestHandler):
         def do_GET(self):
@@ -405,6 +413,7 @@ MALFORMED = [
 ]
 
 
+@pytest.mark.in_turns
 def test_malformed_messages_are_counted_and_dropped(live):
     visitor = live()
     visitor.take_command()
@@ -418,6 +427,7 @@ def test_malformed_messages_are_counted_and_dropped(live):
     assert live.bench.drive.state == "run"
 
 
+@pytest.mark.in_turns
 def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, make_bench, serve, tmp_path):
     bench = make_bench(machine="linear_trapezoid")
     bench.drive.speed_reference_rpm = 600
@@ -465,6 +475,7 @@ def test_a_log_alone_has_what_was_done(bench, tmp_path):
     assert [act["time_s"] for act in found] == pytest.approx([0.0, 0.05], abs=1e-3)
 
 
+@pytest.mark.in_turns
 def test_every_tab_is_readable_on_a_phone(live):
     visitor = live(width=390, height=844)
     visitor.take_command()
@@ -479,12 +490,14 @@ def test_every_tab_is_readable_on_a_phone(live):
         assert nothing_is_cut_off(visitor.page) == [], name
 
 
+@pytest.mark.in_turns
 def test_the_end_of_the_drive_is_said(live):
     visitor = live()
     live.bench.simulator.close()
     visitor.wait("document.getElementById('notice').textContent.includes('the drive has ended')")
 
 
+@pytest.mark.in_turns
 def test_another_dbc_than_that_of_the_drive_is_said_and_no_reference_sent(browser, live, serve):
     visitor = Visitor(browser, serve("--can", live.bench.address, "--machine",
                                      ROOT / "tools/examples/machines/fan12.toml"), live.bench)
@@ -500,6 +513,7 @@ def test_another_dbc_than_that_of_the_drive_is_said_and_no_reference_sent(browse
     visitor.page.close()
 
 
+@pytest.mark.in_turns
 def test_the_page_decodes_every_signal_as_cantools_does(live):
     visitor = live()
     random_ = random.Random(5)
@@ -532,6 +546,7 @@ def test_the_page_decodes_every_signal_as_cantools_does(live):
             assert found[name] == pytest.approx(value, rel=1e-12, nan_ok=True), name
 
 
+@pytest.mark.in_turns
 def test_the_commands_of_the_server_are_those_of_the_interface(live):
     visitor = live()
     names = visitor.page.evaluate("async () => Object.keys((await import('/source.js')).COMMANDS)")

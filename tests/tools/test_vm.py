@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from salient.paths import ROOT
 
 # Standard library only, because imports are slow in the VM.
@@ -52,6 +54,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.in_turns
 def test_command_has_vcan0_and_files_and_returns_output_and_exit_code(tmp_path: Path) -> None:
     result_file = tmp_path / "result, of the VM"
     python = os.path.realpath(sys.executable)  # the virtual environment may be in a folder that the VM does not mount
