@@ -402,4 +402,18 @@ TEST(MovingLoad, rounding_is_that_of_its_formula_for_any_encoder_and_rotation) {
     EXPECT_GT(beats, 10000);
 }
 
+TEST(MovingLoad, the_trend_moves_by_its_exact_product_rounded_down) {
+    Detector detector;
+    std::mt19937 random(3);
+    int64_t expected_q36 = 0;
+    for (int k = 0; k < 20000; k++) {
+        const int32_t innovation = int32_t(random() % uint32_t(COUNT / 4)) - COUNT / 8;
+        const int64_t trend_q4 = expected_q36 >> 32; // rounded down
+        expected_q36 += (int64_t(innovation) * 16 - trend_q4) * detector.parameters.gain_q32;
+        detector.step(innovation);
+        ASSERT_EQ(detector.state.trend_q36, expected_q36) << k;
+    }
+    EXPECT_NE(expected_q36, 0);
+}
+
 } // namespace

@@ -390,4 +390,19 @@ TEST(ObserverBandwidth, a_decay_as_5_over_time_forgets_the_load_step_and_one_as_
     EXPECT_GT(error_growth(3.5), 2.0);
 }
 
+TEST(ObserverBandwidth, the_mean_of_the_innovation_moves_by_its_exact_product_rounded_down) {
+    Bandwidth bandwidth(configure());
+    bandwidth.settle();
+    std::mt19937 random(4);
+    int64_t expected_q32 = bandwidth.statistics.mean_innovation_q32;
+    for (int k = 0; k < 20000; k++) {
+        const int32_t innovation = int32_t(random() % uint32_t(COUNT)) - COUNT / 2; // below the threshold
+        expected_q32 += (std::abs(int64_t(innovation)) - (expected_q32 >> 32)) *
+                        bandwidth.parameters.schedule.mean_innovation_gain_q32;
+        bandwidth.update(innovation, false);
+        ASSERT_EQ(bandwidth.statistics.mean_innovation_q32, expected_q32) << k;
+    }
+    EXPECT_GT(expected_q32 >> 32, COUNT / 8);
+}
+
 } // namespace

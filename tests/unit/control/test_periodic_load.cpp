@@ -345,4 +345,53 @@ TEST(PeriodicLoad, without_a_bandwidth_or_beyond_a_delay_of_eight_values_nothing
     EXPECT_EQ(state.torque_q24, 0);
 }
 
+TEST(PeriodicLoad, values_are_the_means_of_their_intervals_rounded_towards_zero_and_the_torque_is_between_them) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    periodic_load_t load{};
+    const int32_t angle_step = int32_t(REV * 150.0 / 60.0 / RATE_HZ);
+    uint32_t angle = 12345, random = 1;
+    int index = -1, sum_q8 = 0, updates = 0, compared = 0;
+    for (int k = 0; k < 3 * int(REV / angle_step); k++, angle += uint32_t(angle_step)) {
+        const int now = int((angle - uint32_t(angle_step * parameters.lag_periods)) >> 26);
+        const int mean_q8 = updates > 0 ? sum_q8 / updates : 0;
+        const int ended = index;
+        if (now != index) {
+            index = now;
+            sum_q8 = updates = 0;
+        }
+        random = random * 1664525u + 1013904223u;
+        const int32_t load_q24 = int32_t(random) >> 4; // +-8 N m
+        sum_q8 += load_q24 >> 16;
+        updates++;
+        const periodic_load_sample_t sample = {
+            .angle = angle, .angle_step = angle_step, .load_torque_q24 = load_q24, .moving = false};
+        const int profile_q8 = load.mode == PERIODIC_LOAD_CLEAR || ended < 0 ? 0 : load.profile_q8[ended];
+        periodic_load_step(&parameters, &load, &sample);
+        if (updates == 1 && ended >= 0 && k > int(REV / angle_step)) {
+            ASSERT_EQ(load.estimate_q8[ended], mean_q8 + profile_q8) << k;
+            compared++;
+        }
+    }
+    EXPECT_GT(compared, VALUES / 2);
+    // Interpolation: exact in Q24.
+    load.mode = PERIODIC_LOAD_KEEP;
+    for (int value = 0; value < VALUES; value++) {
+        load.profile_q8[value] = int16_t((value * 7919) % 4001 - 2000);
+    }
+    for (int k = 0; k < 5000; k++, angle += uint32_t(angle_step)) {
+        const periodic_load_sample_t sample = {
+            .angle = angle, .angle_step = angle_step, .load_torque_q24 = 0, .moving = false};
+        const std::array<int16_t, VALUES> before = std::to_array(load.profile_q8);
+        periodic_load_step(&parameters, &load, &sample);
+        if (load.mode == PERIODIC_LOAD_CLEAR) {
+            break;
+        }
+        const uint32_t middle = angle + 4u * uint32_t(angle_step) - (1u << 25);
+        const int from_q8 = before[middle >> 26], to_q8 = before[((middle >> 26) + 1) % VALUES];
+        const int fraction_q16 = int((middle << 6) >> 16);
+        ASSERT_EQ(load.torque_q24, from_q8 * 65536 + (to_q8 - from_q8) * fraction_q16) << k;
+    }
+}
+
 } // namespace
