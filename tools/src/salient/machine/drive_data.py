@@ -17,11 +17,9 @@ from salient.machine.parameter_table import SAME_UNITS, ParameterDefinition, rea
 from salient.machine.torque_speed import (
     current_of_torque_A,
     knee_A,
-    mean_torque_Nm,
     smooth_torque_Nm,
     torque_per_flux_Nm_Wb,
 )
-from salient.toml_file import TextFileError
 
 FILE, DERIVED, OVERRIDDEN, DEFAULT = "file", "derived", "overridden", "default"
 """Sources of a value: the table [drive] or another table of the machine file, a formula, [drive.parameters], the row of
@@ -37,6 +35,8 @@ KNEELESS_SPEED_RPM = 1500.0
 SMOOTH_SHARE = 0.8
 """Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
 PEAK_OF_RATED = 1.2
+TORQUE_MIN_NM = 1e-4
+"""Of magnetics that make none: they have data, too, which contradictions.py compares."""
 CURRENT_RANGE_A = 80.0
 """Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
 _CURRENT_SEARCHED_A = 10_000.0
@@ -146,14 +146,14 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
     peak_A = data.add("current_peak_A", "A", *_peak_current(machine, data.given))
     peak_Nm = data.add("torque_peak_Nm", "N m",
                        max(SMOOTH_SHARE * smooth_torque_Nm(magnetics, phases, peak_A),
-                           data.given.get("torque_rated_Nm", 0.0)),
+                           data.given.get("torque_rated_Nm", TORQUE_MIN_NM)),
                        f"{SMOOTH_SHARE:g} * least torque over a stroke of all phases at current_peak_A")
     if "current_rated_A" in data.given:
         rated_Nm = SMOOTH_SHARE * smooth_torque_Nm(magnetics, phases, data.given["current_rated_A"])
         formula = "as torque_peak_Nm, at current_rated_A"
     else:
         rated_Nm, formula = peak_Nm / PEAK_OF_RATED, f"torque_peak_Nm / {PEAK_OF_RATED:g}"
-    rated_Nm = data.add("torque_rated_Nm", "N m", min(rated_Nm, peak_Nm), formula)
+    rated_Nm = data.add("torque_rated_Nm", "N m", max(min(rated_Nm, peak_Nm), TORQUE_MIN_NM), formula)
     rated_A = data.add("current_rated_A", "A",
                        current_of_torque_A(magnetics, phases, rated_Nm / SMOOTH_SHARE, peak_A),
                        "current whose smooth torque, as for torque_peak_Nm, is torque_rated_Nm")
@@ -336,57 +336,3 @@ def _parameter_formulae(machine: Machine, data: dict[str, Any]) -> dict[str, tup
         "winding_time_constant_s": (round(data["thermal_time_constant_s"]), "thermal_time_constant_s"),
         "switch_current_A": (peak_A / math.sqrt(1.5), "current_peak_A / sqrt(1.5)"),
     }
-
-
-# --- contradictions -------------------------------------------------------------------------------------------------
-
-def check(machine: Machine) -> None:
-    """TextFileError: what the table [drive] states contradicts itself, another table or what follows from both; the
-    text names the two. A file without the table is never refused."""
-    if not machine.drive and not machine.drive_parameters:
-        return
-    data = derive(machine)
-    values = {each.name: each.value for each in data.derivations}
-    values["converter.supply_voltage_V"] = machine.supply_voltage_V
-    values["dc_link.chopper_on_V"] = (machine.dc_link or {}).get("chopper_on_V", 0.0)
-    places = {each.name: _place(each, machine) for each in data.derivations}
-
-    def in_order(low: str, high: str, factor: float = 1.0) -> None:
-        if values[low] > factor * values[high]:
-            most = "" if factor == 1.0 else f"{factor:g} of "
-            raise TextFileError(f"{places.get(low, low)}: {values[low]:g}: must not be above {most}"
-                                f"{places.get(high, high)}, {values[high]:g}")
-
-    in_order("supply_min_V", "converter.supply_voltage_V")
-    in_order("converter.supply_voltage_V", "supply_max_V")
-    in_order("current_rated_A", "current_peak_A")
-    in_order("torque_rated_Nm", "torque_peak_Nm")
-    in_order("speed_base_rpm", "speed_max_rpm")
-    in_order("current_peak_A", "adc_current_A", 0.9)
-    in_order("current_limit_A", "current_trip_A", 0.98)
-    in_order("current_trip_A", "adc_current_A", 0.9875)
-    in_order("under_voltage_V", "supply_min_V", 0.98)
-    in_order("supply_max_V", "over_voltage_V", 0.98)
-    in_order("dc_link.chopper_on_V", "over_voltage_V")
-    in_order("over_voltage_V", "adc_voltage_V", 0.995)
-    in_order("speed_max_rpm", "over_speed_rpm")
-    in_order("torque_band_inner_Nm", "torque_band_outer_Nm")
-    most_Nm = mean_torque_Nm(machine.magnetics, machine.phases, data.current_peak_A)
-    for name in ("torque_peak_Nm", "torque_rated_Nm"):
-        if values[name] > most_Nm:
-            raise TextFileError(f"{places[name]}: {values[name]:g}: must not be above {most_Nm:.3g}, the mean torque "
-                                f"at {places['current_peak_A']}, {data.current_peak_A:g}")
-    samples = 60.0 * data.control_rate_hz / (data.speed_max_rpm * machine.rotor_poles)
-    if samples < SAMPLES_PER_TURN_MIN * (1.0 - 1e-9):
-        raise TextFileError(f"{places['speed_max_rpm']}: {data.speed_max_rpm:g}: {samples:.3g} control periods in an "
-                            f"electrical revolution at {places['control_rate_hz']}, {data.control_rate_hz}; must be at "
-                            f"least {SAMPLES_PER_TURN_MIN}")
-
-
-def _place(derivation: Derivation, machine: Machine) -> str:
-    """Key of a value in a message."""
-    if derivation.name in machine.drive:
-        return f"drive.{derivation.name}"
-    if derivation.name in machine.drive_parameters:
-        return f"drive.parameters.{derivation.name}"
-    return f"{derivation.name} ({derivation.source})"

@@ -13,8 +13,9 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 
 from salient.errors import close_names, shown
+from salient.machine.contradictions import contradiction
 from salient.machine.definition import Machine, MachineError
-from salient.machine.drive_data import check
+from salient.machine.facts import Facts
 from salient.machine.flux_map import FluxMap, FluxMapError
 from salient.machine.flux_map_csv import load_flux_map
 from salient.machine.magnetics import FORMULA_KEYS, INDUCTANCES, Formula
@@ -163,9 +164,11 @@ def load_machine(path: Path | str) -> Machine:
         stator, rotor, phases = _poles(file.poles)
         magnetics = _magnetics(path, file.magnetics, rotor)
         if file.dc_link is not None:
-            _check_chopper(file.dc_link, file.converter.supply_voltage_V)
+            _check_chopper(file.dc_link)
         machine = _machine(file, (stator, rotor, phases), magnetics)
-        check(machine)
+        mistake = contradiction(Facts(machine))
+        if mistake is not None:
+            raise TextFileError(mistake)
     except TextFileError as error:
         raise MachineError(f"{path}: {error}") from None
     return machine
@@ -201,15 +204,12 @@ def _poles(poles: Poles) -> tuple[int, int, int]:
     raise TextFileError(f"poles: {shown(poles.stator)}/{shown(poles.rotor)}: must be one of {names}")
 
 
-def _check_chopper(link: DcLink, supply_voltage_V: float) -> None:
-    """All keys of the chopper or none, and its thresholds in order above the supply."""
+def _check_chopper(link: DcLink) -> None:
+    """All keys of the chopper or none."""
     chopper = {key: getattr(link, key) for key in DcLink.model_fields if key.startswith("chopper_")}
     missing = [key for key, value in chopper.items() if value is None]
     if missing and len(missing) < len(chopper):
         raise TextFileError(f"dc_link.{missing[0]}: missing")
-    on_V, off_V = link.chopper_on_V, link.chopper_off_V
-    if on_V is not None and off_V is not None and not supply_voltage_V < off_V < on_V:
-        raise TextFileError("dc_link.chopper_off_V: must be above converter.supply_voltage_V and below chopper_on_V")
 
 
 def _parameters(table: dict[str, Any]) -> dict[str, float]:
@@ -239,11 +239,7 @@ def _magnetics(path: Path, table: dict[str, Any], rotor_poles: int) -> Formula |
     keys = validate(MAGNETICS[form], table, "magnetics")
     if isinstance(keys, MapMagnetics):
         return _flux_map(path.parent / keys.file, rotor_poles)
-    formula = Formula(form, rotor_poles, keys.model_dump(exclude={"form"}))
-    mistake = formula.mistake()
-    if mistake is not None:
-        raise TextFileError(f"magnetics.{mistake[0]}: {mistake[1]}")
-    return formula
+    return Formula(form, rotor_poles, keys.model_dump(exclude={"form"}))
 
 
 def _flux_map(path: Path, rotor_poles: int) -> FluxMap:

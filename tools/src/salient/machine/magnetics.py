@@ -49,28 +49,6 @@ class Formula:
         """Incremental inductance of the unsaturated phase, d psi / d i at 0 A."""
         return self.parameters["unaligned_inductance_H"]
 
-    def mistake(self) -> tuple[str, str] | None:
-        """A key whose value contradicts another one, and why, with the other's name; None if consistent."""
-        m = self.parameters
-        if m["aligned_inductance_H"] <= m["unaligned_inductance_H"]:
-            return "aligned_inductance_H", "must be above unaligned_inductance_H"
-        if self.form == "linear_trapezoid" and 2.0 * (m["flat_deg"] + m["blend_deg"]) >= 180.0 / self.rotor_poles:
-            return "blend_deg", "flats and blends do not fit into half a rotor pitch"
-        if self.form == "saturating":
-            if m["saturated_inductance_H"] > m["unaligned_inductance_H"]:
-                return "saturated_inductance_H", "must not exceed unaligned_inductance_H"
-            if m["saturated_inductance_H"] * m["current_at_flux_linkage_max_A"] >= m["flux_linkage_max_Wb"]:
-                return "flux_linkage_max_Wb", "must exceed saturated_inductance_H * current_at_flux_linkage_max_A"
-            most_Wb = m["aligned_inductance_H"] * m["current_at_flux_linkage_max_A"]
-            if m["flux_linkage_max_Wb"] > most_Wb * (1.0 + 1e-9):
-                # Saturation lowers the inductance: no point of a magnetisation curve is above its first slope.
-                return "flux_linkage_max_Wb", (
-                    f"{m['flux_linkage_max_Wb']:g} Wb: must not be above {most_Wb:.4g} Wb, which"
-                    f" aligned_inductance_H, {m['aligned_inductance_H']:g} H, gives without saturation at"
-                    f" current_at_flux_linkage_max_A, {m['current_at_flux_linkage_max_A']:g} A"
-                )
-        return None
-
     def flux_linkage_Wb(self, angle_rad: ArrayLike, current_A: ArrayLike) -> np.ndarray:
         """psi."""
         i = np.asarray(current_A, dtype=float)

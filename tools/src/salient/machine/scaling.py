@@ -31,6 +31,7 @@ import cantools
 from cantools.database.can import Database
 
 from salient.machine.drive_data import CURRENT_RANGE_A, SAMPLES_PER_TURN_MIN, DriveData, derive
+from salient.machine.facts import Facts
 from salient.machine.file import Machine, MachineError
 from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
@@ -195,20 +196,10 @@ def _check(data: DriveData, exponents: Exponents, machine: Machine) -> None:
     for key, (row, value) in values.items():
         low, high = (math.ldexp(raw, -exponents.fraction_bits(row)) for raw in (row.minimum, row.maximum))
         if not low - 1e-6 * abs(low) <= value <= high + 1e-6 * abs(high):
-            raise _OutOfRange(f"{key}: {value:g}: must be a number from {low:.4g} to {high:.4g}, for a machine"
-                              f" of {data.torque_peak_Nm:.3g} N m and {data.speed_max_rpm:.0f} r/min: they follow from"
-                              f" {_torque_keys(data, machine)}")
-
-
-def _torque_keys(data: DriveData, machine: Machine) -> str:
-    """The keys, with their values, from which the torque and the speed follow that bound inertia and friction."""
-    stated = [f"drive.{name}, {machine.drive[name]:g} {unit}"
-              for name, unit in (("torque_peak_Nm", "N m"), ("speed_max_rpm", "r/min")) if name in machine.drive]
-    if len(stated) < 2:
-        flux_Wb = float(machine.magnetics.flux_linkage_Wb(0.0, data.current_peak_A))
-        key = {"saturating": "flux_linkage_max_Wb", "map": "file"}.get(machine.magnetics.form, "aligned_inductance_H")
-        stated.append(f"magnetics.{key}, {flux_Wb:.3g} Wb aligned at {data.current_peak_A:.3g} A")
-    return " and ".join(stated)
+            unit, facts = f" {row.unit}".rstrip(), Facts(machine)
+            of_speed = f" and {facts.shown('speed_max_rpm')}" if exponents.speed and exponents.of_parameter(row) else ""
+            raise _OutOfRange(f"{key}: {value:g}{unit}: must be a number from {low:.4g} to {high:.4g}{unit}, for a"
+                              f" machine of {facts.shown('torque_peak_Nm')}{of_speed}")
 
 
 # --- CAN database ---------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ _FLUX_POINTS = 128
 
 _CHANGE_STEPS = 3000
 _STROKE_POINTS = 61
+_BOUND_POINTS = 201
 _SEARCH_POINTS = 80
 _BISECTIONS = 24  # to 1e-7 of the range
 
@@ -35,6 +36,18 @@ def smooth_torque_Nm(magnetics: Any, phases: int, current_A: float) -> float:
 def mean_torque_Nm(magnetics: Any, phases: int, current_A: float) -> float:
     """The mean over a stroke of what smooth_torque_Nm takes the least of: no commutation makes more."""
     return float(_stroke_torque_Nm(magnetics, phases, np.array([current_A])).mean())
+
+
+def torque_bound_Nm(magnetics: Any, phases: int, current_A: float, voltage_s_rad: float) -> float:
+    """Mean torque that no commutation exceeds, of currents up to current_A at a voltage over speed, V s/rad: the flux
+    linkage rises for at most half a pole pitch, as it has to fall again, and a stroke converts at most what lies
+    between the aligned and the unaligned curve up to that flux linkage. Resistance would leave less."""
+    grid_A = np.linspace(0.0, current_A, _BOUND_POINTS)
+    aligned_Wb, unaligned_Wb = (magnetics.flux_linkage_Wb(angle_rad, grid_A)
+                                for angle_rad in (0.0, 0.5 * magnetics.pitch_rad))
+    flux_Wb = np.linspace(0.0, min(0.5 * magnetics.pitch_rad * voltage_s_rad, float(aligned_Wb[-1])), _BOUND_POINTS)
+    between_A = np.interp(flux_Wb, unaligned_Wb, grid_A) - np.interp(flux_Wb, aligned_Wb, grid_A)
+    return float(np.trapezoid(between_A, flux_Wb)) * phases / magnetics.pitch_rad
 
 
 def _stroke_torque_Nm(magnetics: Any, phases: int, current_A: np.ndarray) -> np.ndarray:
@@ -77,13 +90,15 @@ def knee_A(magnetics: Any, current_max_A: float) -> float:
 
 
 def torque_per_flux_Nm_Wb(magnetics: Any, current_A: float) -> float:
-    """dT/dpsi at an angle, N m/Wb: the mean over the angles at which the torque is at least half of its maximum."""
+    """dT/dpsi at an angle, N m/Wb: the mean over the angles at which the torque is at least half of its maximum; nan
+    where there is no torque."""
     angle_rad = np.linspace(0.5, 1.0, 182)[1:-1] * magnetics.pitch_rad
     low_A, high_A = 0.95 * current_A, 1.05 * current_A
     torque_Nm = magnetics.torque_Nm(angle_rad, current_A)
     slope = ((magnetics.torque_Nm(angle_rad, high_A) - magnetics.torque_Nm(angle_rad, low_A))
              / (magnetics.flux_linkage_Wb(angle_rad, high_A) - magnetics.flux_linkage_Wb(angle_rad, low_A)))
-    return float(np.mean(slope[torque_Nm >= 0.5 * torque_Nm.max()]))
+    strong = torque_Nm >= 0.5 * torque_Nm.max()
+    return float(np.mean(slope[strong])) if torque_Nm.max() > 0.0 else math.nan
 
 
 def _inverse_table(magnetics: Any, current_A: float) -> tuple[np.ndarray, np.ndarray]:
