@@ -138,7 +138,7 @@ def _rising_H(of: Facts) -> float:
     def rises(inductance_H: float) -> bool:
         changed = replace(magnetics, parameters={**magnetics.parameters, "unaligned_inductance_H": inductance_H})
         torque_Nm = changed.torque_Nm(0.75 * magnetics.pitch_rad, current_A)
-        return float(torque_Nm.max()) * (1.0 - FALL_MAX) <= torque_Nm[-1]
+        return float(torque_Nm.max()) * (1.0 - FALL_MAX) <= float(torque_Nm[-1])
 
     low_H, high_H = magnetics.parameters["saturated_inductance_H"], magnetics.unaligned_inductance_H
     if rises(high_H):
@@ -309,8 +309,8 @@ _RULES_OF_TORQUE = (
          f"at which winding and devices take {DROP_MAX:g} of the supply at {{current_rated_A}}:", "supply_min_V"),
     Rule(lambda of: of.inductance_key, lambda of: of.machine.magnetics.unaligned_inductance_H
          * _rise_A(of) / (RISE_MAX * of["current_peak_A"]),
-         f"or the current rises by more than {RISE_MAX:g} times {{current_peak_A}} in a period of {{control_rate_hz}} at",
-         "supply_max_V", least=True, when=lambda of: not of.is_map),
+         f"or the current rises by more than {RISE_MAX:g} times {{current_peak_A}} in a period of {{control_rate_hz}}"
+         " at", "supply_max_V", least=True, when=lambda of: not of.is_map),
     Rule("mechanics.friction_Nm_s", lambda of: of["torque_peak_Nm"] / _base_rad_s(of),
          "which takes all torque at {speed_base_rpm}:", "torque_peak_Nm"),
     Rule("mechanics.inertia_kg_m2",

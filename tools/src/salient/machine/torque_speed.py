@@ -47,7 +47,7 @@ def torque_bound_Nm(magnetics: Any, phases: int, current_A: float, voltage_s_rad
                                 for angle_rad in (0.0, 0.5 * magnetics.pitch_rad))
     flux_Wb = np.linspace(0.0, min(0.5 * magnetics.pitch_rad * voltage_s_rad, float(aligned_Wb[-1])), _BOUND_POINTS)
     between_A = np.interp(flux_Wb, unaligned_Wb, grid_A) - np.interp(flux_Wb, aligned_Wb, grid_A)
-    return float(np.trapezoid(between_A, flux_Wb)) * phases / magnetics.pitch_rad
+    return float(np.trapezoid(between_A, flux_Wb) * phases / magnetics.pitch_rad)
 
 
 def _stroke_torque_Nm(magnetics: Any, phases: int, current_A: np.ndarray) -> np.ndarray:
