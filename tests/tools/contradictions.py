@@ -227,8 +227,8 @@ def blends_beyond_the_pitch(case: Case) -> Keys | None:
     half_deg = _trapezoid(case)
     if half_deg is None:
         return None
-    flat_deg = case.chance.uniform(0.0, 0.4) * (0.5 * half_deg - half_deg / case.machine.phases)
-    blend_deg = (0.5 * half_deg - flat_deg) * case.factor(1.02, 3.0)
+    flat_deg = case.chance.uniform(0.5, 0.95) * (0.5 * half_deg - half_deg / case.machine.phases)
+    blend_deg = (0.5 * half_deg - flat_deg) * case.factor(1.02, 1.3)
     case.text.set(magnetics__flat_deg=flat_deg, magnetics__blend_deg=blend_deg)
     return ("magnetics.blend_deg", "magnetics.flat_deg") if blend_deg <= 20.0 else None
 
@@ -236,6 +236,7 @@ def blends_beyond_the_pitch(case: Case) -> Keys | None:
 # --- supply and DC link ---
 
 def supply_below_its_range(case: Case) -> Keys:
+    case.text.forget("dc_link")
     case.text.set(drive__supply_min_V=case.machine.supply_voltage_V * case.factor(1.02, 1.9),
                   drive__supply_max_V=2000.0)
     return "drive.supply_min_V", "converter.supply_voltage_V"
@@ -469,7 +470,7 @@ def base_above_largest_speed(case: Case) -> Keys:
 def speed_beyond_the_control_rate(case: Case) -> Keys | None:
     rpm = 60.0 * case.data.control_rate_hz / 25.0 / case.machine.rotor_poles * case.factor(1.01, 10.0)
     case.text.set(drive__speed_max_rpm=rpm)
-    return "drive.speed_max_rpm", "control_rate_hz"
+    return ("drive.speed_max_rpm", "control_rate_hz") if rpm <= 100_000.0 else None
 
 
 def speed_trip_below_the_largest(case: Case) -> Keys:

@@ -311,8 +311,6 @@ _RULES_OF_TORQUE = (
          * _rise_A(of) / (RISE_MAX * of["current_peak_A"]),
          f"or the current rises by more than {RISE_MAX:g} times {{current_peak_A}} in a period of {{control_rate_hz}}"
          " at", "supply_max_V", least=True, when=lambda of: not of.is_map),
-    Rule("mechanics.friction_Nm_s", lambda of: of["torque_peak_Nm"] / _base_rad_s(of),
-         "which takes all torque at {speed_base_rpm}:", "torque_peak_Nm"),
     Rule("mechanics.inertia_kg_m2",
          lambda of: of["torque_peak_Nm"] / of["control_rate_hz"] / (GAIN_MAX * _base_rad_s(of)),
          f"or the speed changes by {GAIN_MAX:g} times {{speed_base_rpm}} in a period of {{control_rate_hz}} by",
@@ -328,6 +326,8 @@ _RULES_OF_SPEED = (
          " built up by", "supply_min_V", least=True),
     Rule("speed_base_rpm", _speed_rpm(lambda of, speed: of["torque_rated_Nm"]),
          "up to where the voltage makes {torque_rated_Nm} from", "supply_max_V"),
+    Rule("mechanics.friction_Nm_s", lambda of: of["torque_peak_Nm"] / _base_rad_s(of),
+         "which takes all torque at {speed_base_rpm}:", "torque_peak_Nm"),
     Rule("speed_max_rpm", _speed_rpm(lambda of, speed: of["mechanics.friction_Nm_s"] * speed),
          "up to where the voltage makes the torque of {mechanics/friction_Nm_s} from", "supply_max_V",
          when=_stated("speed_max_rpm")),
