@@ -658,7 +658,9 @@ COMMAND_CASES: dict[str, tuple[str, str | None, str]] = {
     "value_nan": (GOOD.replace("0.05", "nan", 1), None, "winding.resistance_ohm"),
     "nested": ("a = " + "[" * 20_000, None, "not TOML"),
     "flux_linkage_beyond_its_format": (
-        toml({**GOOD_TABLES, "magnetics": {"form": '"linear_cosine"', "unaligned_inductance_H": "0.67e-3",
+        toml({**GOOD_TABLES, "mechanics": {"inertia_kg_m2": "0.02", "friction_Nm_s": "0.001"},
+              "iron_loss": {**GOOD_TABLES["iron_loss"], "turns_area_m2": "20"},
+              "magnetics": {"form": '"linear_cosine"', "unaligned_inductance_H": "40e-3",
                                            "aligned_inductance_H": "0.6"}}), None, "must be below 16 Wb"),
     "file_cut": (GOOD[: GOOD.index("[converter]")], None, "converter: missing"),
     "file_binary": ("\0" * 100, None, "line 1"),

@@ -97,7 +97,7 @@ class Comms : public testing::Test {
         drive.control_rate_hz = 40000;
         drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
-        parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 1;
+        parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 1);
         comms_init(&comms, 0, 0);
     }
 
@@ -377,12 +377,12 @@ TEST_F(Comms, the_heartbeat_survives_a_pause_of_telemetry_in_which_other_nodes_f
 }
 
 TEST_F(Comms, periods_follow_the_parameters_from_the_last_frame_on) {
-    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 4;
+    parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 4);
     run(20500);
-    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 7;
-    parameters.values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS] = 3;
+    parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 7);
+    parameters_set(&parameters, PARAMETER_TELEMETRY_SLOW_PERIOD_MS, 3);
     run(60500);
-    parameters.values[PARAMETER_TELEMETRY_PERIOD_MS] = 1;
+    parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 1);
     run(64900);
     std::vector<int> fast;
     for (const auto &frame : bus.sent) {
