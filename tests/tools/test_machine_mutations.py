@@ -659,7 +659,7 @@ COMMAND_CASES: dict[str, tuple[str, str | None, str]] = {
     "nested": ("a = " + "[" * 20_000, None, "not TOML"),
     "flux_linkage_beyond_its_format": (
         toml({**GOOD_TABLES, "mechanics": {"inertia_kg_m2": "0.02", "friction_Nm_s": "0.001"},
-              "iron_loss": {**GOOD_TABLES["iron_loss"], "turns_area_m2": "20"},
+              "iron_loss": {**GOOD_TABLES["iron_loss"], "turns_area_m2": "10"},
               "magnetics": {"form": '"linear_cosine"', "unaligned_inductance_H": "40e-3",
                                            "aligned_inductance_H": "0.6"}}), None, "must be below 16 Wb"),
     "file_cut": (GOOD[: GOOD.index("[converter]")], None, "converter: missing"),
