@@ -332,7 +332,7 @@ def test_controller_is_changed_over_can_between_runs(bench):
         assert bench.telemetry["DRIVE_STATUS.controller"].last_name == name
         bench.load_torque_Nm = 8
         bench.run_for(0.2)
-        with pytest.raises(DriveError, match="controller 1: not_while_running"):
+        with pytest.raises(DriveError, match="controller paper: not_while_running"):
             bench.drive.parameters["controller"] = 1
         speed_rpm = bench.truth["speed_rpm"].between(bench.time_s - 0.05, bench.time_s).value
         assert 149.2 < speed_rpm.min() < speed_rpm.max() < 150.8

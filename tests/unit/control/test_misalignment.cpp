@@ -452,7 +452,7 @@ misalignment_t any_state(std::mt19937 &random) {
         of.slope_lag1_q24 = up_to(4 << 24);
         of.slope_lag2_q24 = up_to(4 << 24);
         of.slope_mean_q24 = up_to(1 << 24);
-        of.offset_q40 = int64_t(up_to(1 << 30)) * 1024;
+        of.offset_q40 = int64_t(up_to(1 << 29)) * 2048;
     }
     state.disturbance_mean_q24 = up_to(1 << 24);
     state.power_q24 = wide_integer::any_up_to(random, 8 << 24);
