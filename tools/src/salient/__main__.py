@@ -169,7 +169,7 @@ def _sweep(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out, options.json, options.dbc, options.node)
+    return run(options.machine, options.out, options.json, options.dbc, options.node, options.table)
 
 
 def _wheel(options: argparse.Namespace) -> int:

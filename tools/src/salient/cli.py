@@ -189,7 +189,10 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                       "magnetics")
     machine.add_argument("machine", metavar="NAME|FILE")
     machine.add_argument("--out", type=Path, default=OUT / "machine", metavar="DIR",
-                         help="folder of the plot (default %(default)s)")
+                         help="folder of the plot, and of what --import writes (default %(default)s)")
+    machine.add_argument("--import", dest="table", type=Path, metavar="FILE",
+                         help="first import a table of flux linkages of any layout (CSV, text, MAT) as the map of the "
+                         "machine: writes its machine file with the map to the folder")
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")

@@ -24,7 +24,7 @@ from salient.machine.path import machine_path
 from salient.toml_file import Table, TextFileError, checked, number, one_of, option, read_toml, shown_key, validate
 
 __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "MachineFile", "Sensors", "load_machine",
-           "machine_path"]
+           "machine_path", "poles_and_phases"]
 
 FORMS = (*FORMULA_KEYS, "map")
 
@@ -161,7 +161,7 @@ def load_machine(path: Path | str) -> Machine:
     try:
         data = read_toml(path)
         file = validate(MachineFile, data)
-        stator, rotor, phases = _poles(file.poles)
+        stator, rotor, phases = poles_and_phases(file.poles)
         magnetics = _magnetics(path, file.magnetics, rotor)
         if file.dc_link is not None:
             _check_chopper(file.dc_link)
@@ -195,7 +195,7 @@ def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula 
     )
 
 
-def _poles(poles: Poles) -> tuple[int, int, int]:
+def poles_and_phases(poles: Poles) -> tuple[int, int, int]:
     """Stator poles, rotor poles and phases."""
     pair = (poles.stator, poles.rotor)
     if all(type(number) is int for number in pair) and pair in _PHASES:

@@ -30,6 +30,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from salient.machine.flux_map_origin import find_origin
+
 # As in emulator/plant/flux_map.h.
 ANGLE_INTERVALS = 96
 CURRENT_INTERVALS = 64
@@ -45,6 +47,12 @@ FALL_TOLERANCE = 0.01  # rise away from the aligned position, of the aligned flu
 MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest flux linkage
 RISE_TOLERANCE = 0.05  # above the inductance at lower currents, of the map's greatest flux linkage
 REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of that of the others
+
+# From which the aligned position that the symmetry shows is another than 0, in electrical degrees, if it is more than its
+# uncertainty: 0.42 deg of an 8/6.
+ORIGIN_TOLERANCE_RAD = math.radians(2.5)
+
+IMPORT_HINT = "tools/salient machine MACHINE --import FILE shifts, symmetrises and resamples a map"
 
 # Below it, time constants of the winding would make the emulator's steps as small as no machine needs them.
 INDUCTANCE_MIN_H = 1e-6
@@ -161,6 +169,7 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     current_max_A = _common_current_A(curves)
     current_A = np.linspace(0.0, current_max_A, CURRENT_INTERVALS + 1)
     flux_Wb = np.array([_read_curve(curve, current_A) for curve in curves])
+    _check_origin(curves, flux_Wb, rotor_poles)
     _check_fall(curves, flux_Wb, half_rad, current_A)
 
     angle_rad = np.array([curve.angle_rad for curve in curves])
@@ -168,7 +177,7 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     slopes = _limited(angle_rad, flux_Wb, _spline_slopes(angle_rad, flux_Wb, flat_ends=True), ANGLE_LIMITS)
     grid_Wb = _hermite(angle_rad, flux_Wb, slopes, uniform_rad)
     if whole:
-        _check_mirror(grid_Wb, uniform_rad, current_A)
+        _check_mirror(curves, grid_Wb, uniform_rad, current_A)
         grid_Wb = 0.5 * (grid_Wb + grid_Wb[::-1])[: ANGLE_INTERVALS + 1]
 
     over_current = _coefficients(grid_Wb.T, current_A[1], flat_ends=False)
@@ -177,6 +186,18 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     model = FluxMap(rotor_poles, current_max_A, _integral(flux_coefficients, current_A[1]), file)
     _check_model(model, curves)
     return model
+
+
+def _check_origin(curves: Sequence[Curve], flux_Wb: np.ndarray, rotor_poles: int) -> None:
+    """The aligned position, where the map is symmetric, is at 0. Half a pitch shows it by the slopes at its ends."""
+    angle_rad = np.array([curve.angle_rad for curve in curves])
+    origin = find_origin(rotor_poles * angle_rad, flux_Wb[:, 1:])
+    if abs(origin.aligned_rad) > max(ORIGIN_TOLERANCE_RAD, 1.5 * origin.error_rad):
+        aligned_deg, error_deg = (math.degrees(of) / rotor_poles for of in (origin.aligned_rad, origin.error_rad))
+        raise FluxMapError(
+            f"line {curves[0].lines[0]}: the map is symmetric about {aligned_deg:.3f} +- {error_deg:.3f} deg, not about 0"
+            f" (aligned): {IMPORT_HINT}"
+        )
 
 
 def _check_inductance(curves: Sequence[Curve]) -> None:
@@ -250,15 +271,20 @@ def _check_fall_in(order: Sequence[int], curves: Sequence[Curve], flux_Wb: np.nd
         )
 
 
-def _check_mirror(grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndarray) -> None:
+def _check_mirror(curves: Sequence[Curve], grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndarray) -> None:
+    """The halves of a whole pitch agree. Named are the points of the file that are nearest to the largest difference."""
     difference_Wb = np.abs(grid_Wb - grid_Wb[::-1])
     row, column = np.unravel_index(np.argmax(difference_Wb), difference_Wb.shape)
-    if difference_Wb[row, column] > MIRROR_TOLERANCE * np.max(grid_Wb):
+    worst_Wb = float(difference_Wb[row, column])
+    if worst_Wb > MIRROR_TOLERANCE * np.max(grid_Wb):
+        nearest = [min(curves, key=lambda curve, at=angle_rad[at]: abs(curve.angle_rad - at)) for at in (row, -1 - row)]
+        places = " and ".join(f"line {_nearest_line(curve, current_A[column])} ({_degrees(curve.angle_rad)} deg)"
+                              for curve in nearest)
         raise FluxMapError(
-            f"the halves of the pitch do not mirror each other: at {current_A[column]:.3g} A the flux linkage is"
-            f" {grid_Wb[row, column]:.4g} Wb at {_degrees(angle_rad[row])} deg and"
-            f" {grid_Wb[-1 - row, column]:.4g} Wb at {_degrees(angle_rad[-1 - row])} deg; they must"
-            f" agree within {MIRROR_TOLERANCE:.0%} of the largest"
+            f"{places}: the halves of the pitch do not mirror each other: at"
+            f" {_nearest_current(nearest[0], current_A[column]):.5g} A they differ by {worst_Wb:.4g} Wb,"
+            f" {worst_Wb / np.max(grid_Wb):.1%} of the largest flux linkage; they must agree within"
+            f" {MIRROR_TOLERANCE:.0%}: {IMPORT_HINT}"
         )
 
 
@@ -268,7 +294,8 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
         nearest = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
         raise FluxMapError(
             f"line {_nearest_line(nearest, current_A)}: the curve through the points has an incremental inductance of"
-            f" {least_H:.3g} H near {_degrees(angle_rad)} deg and {current_A:.3g} A; it must be at least"
+            f" {least_H:.3g} H near {_degrees(nearest.angle_rad)} deg and {_nearest_current(nearest, current_A):.5g} A; it"
+            " must be at least"
             f" {INDUCTANCE_MIN_H:g} H: the points there are too uneven, or in another unit"
         )
     allowed_Wb = MISS_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
@@ -286,6 +313,10 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
 
 def _nearest_line(curve: Curve, current_A: float) -> int:
     return curve.lines[int(np.argmin(np.abs(curve.current_A - current_A)))]
+
+
+def _nearest_current(curve: Curve, current_A: float) -> float:
+    return float(curve.current_A[int(np.argmin(np.abs(curve.current_A - current_A)))])
 
 
 def _degrees(angle_rad: float) -> str:

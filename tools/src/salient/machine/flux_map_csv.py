@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.machine.flux_map import Curve, FluxMap, FluxMapError, fit
+from salient.machine.flux_map import IMPORT_HINT, Curve, FluxMap, FluxMapError, fit
 from salient.toml_file import TextFileError, read_text
 
 FILE_BYTES_MAX = 20_000_000
@@ -42,10 +42,14 @@ _COLUMNS = (
 def load_flux_map(path: Path, rotor_poles: int) -> FluxMap:
     """The model of a CSV file's map. FluxMapError: one line with the file and where possible its line."""
     try:
-        text = read_text(path, FILE_BYTES_MAX)
-        return fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles, path)
+        return map_of_text(read_text(path, FILE_BYTES_MAX), rotor_poles, path)
     except (FluxMapError, TextFileError) as error:
         raise FluxMapError(f"{path}: {error}") from None
+
+
+def map_of_text(text: str, rotor_poles: int, path: Path | None = None) -> FluxMap:
+    """The model of the text of a file. FluxMapError: one line without the file."""
+    return fit(_curves(_points(text), math.pi / rotor_poles), rotor_poles, path)
 
 
 Point = tuple[int, float, float, float]
@@ -62,7 +66,7 @@ def _points(text: str) -> list[Point]:
         raise FluxMapError(f"no header; must be {_header_names()}")
     line, header = rows[0]
     if len(header) != len(_COLUMNS) or any(name not in allowed for name, allowed in zip(header, _COLUMNS, strict=True)):
-        raise FluxMapError(f"line {line}: {','.join(header)!r:.100}: the header must be {_header_names()}")
+        raise FluxMapError(f"line {line}: {','.join(header)!r:.100}: the header must be {_header_names()}: {IMPORT_HINT}")
     factors = [allowed[name] for name, allowed in zip(header, _COLUMNS, strict=True)]
     return [(line, *_numbers(line, cells, header, factors)) for line, cells in rows[1:]]
 
@@ -110,13 +114,14 @@ def _ends_rad(groups: list[list[Point]], half_rad: float) -> dict[int, float]:
     half_deg = math.degrees(half_rad)
     first_deg, last_deg = math.degrees(groups[0][0][1]), math.degrees(groups[-1][0][1])
     if first_deg > ANGLE_TOLERANCE_DEG:
-        raise FluxMapError(f"line {groups[0][0][0]}: the angles begin at {first_deg:.5g} deg; must be 0 (aligned)")
+        raise FluxMapError(f"line {groups[0][0][0]}: the angles begin at {first_deg:.5g} deg; must be 0 (aligned):"
+                           f" {IMPORT_HINT}")
     for pitches in (1, 2):
         if abs(last_deg - pitches * half_deg) <= ANGLE_TOLERANCE_DEG:
             return {0: 0.0, len(groups) - 1: pitches * half_rad}
     raise FluxMapError(
         f"line {groups[-1][-1][0]}: the angles end at {last_deg:.5g} deg; must be half a rotor pitch"
-        f" ({half_deg:.5g} deg, unaligned) or a whole one ({2.0 * half_deg:.5g} deg)"
+        f" ({half_deg:.5g} deg, unaligned) or a whole one ({2.0 * half_deg:.5g} deg): {IMPORT_HINT}"
     )
 
 

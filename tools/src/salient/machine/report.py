@@ -18,6 +18,7 @@ from salient.errors import UsageError
 from salient.machine.drive_report import drive_json, drive_lines, pulse_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
+from salient.machine.map_import.command import import_map
 from salient.machine.scaling import scaling_of
 
 # Currents in the machine's unit (scaling.py): up to the end of the firmware's tables.
@@ -27,14 +28,19 @@ SHOWN_PITCHES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 
 
 def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: Path | None = None,
-        node: int = 0) -> int:
+        node: int = 0, table: Path | None = None) -> int:
     """Checks the file, prints its data sheet and the drive's data, plots its magnetics; returns 0. UsageError.
 
     json_path: the drive's data are also written there; dbc_path: the CAN database of its drive
-    with a node number.
+    with a node number. table: file of flux linkages; the machine file with it as its map is written first, and is the
+    one that is checked.
     """
     try:
         path = machine_path(name_or_path)
+        if table is not None:
+            path, corrections = import_map(path, table, out)
+            print("\n".join([f"imported: {table}", *(f"  {line}" for line in corrections),
+                             f"machine file: {path}, with its map beside it"]))
         machine = load_machine(path)
         scaling = scaling_of(path, machine)
         machine_phase_map(path, machine, scaling.exponents)
@@ -67,6 +73,17 @@ def _ampere(machine: Machine) -> float:
     return float(2.0**scaling_of(machine.name, machine).exponents.current)
 
 
+def _saturation(machine: Machine) -> str:
+    """How much of its aligned inductance a machine has left at the largest current shown."""
+    current_A = min(SHOWN[-1] * _ampere(machine), machine.magnetics.current_max_A)
+    small_A = 1e-3
+    left = float(machine.magnetics.flux_linkage_Wb(0.0, current_A)) / current_A
+    left /= float(machine.magnetics.flux_linkage_Wb(0.0, small_A)) / small_A
+    if left > 0.99:
+        return "; no saturation"
+    return f"; saturation leaves {100.0 * left:.0f} % aligned at {current_A:g} A"
+
+
 def describe(machine: Machine) -> list[str]:
     """The lines of a data sheet."""
     magnetics, half = machine.magnetics, machine.pitch_rad / 2.0
@@ -79,7 +96,7 @@ def describe(machine: Machine) -> list[str]:
         f"{machine.name}: {machine.stator_poles}/{machine.rotor_poles} poles, {machine.phases} phases,"
         f" magnetics {magnetics.form}",
         f"  winding     {machine.resistance_ohm:g} ohm; {aligned_H * 1e3:.2f} mH aligned,"
-        f" {magnetics.unaligned_inductance_H * 1e3:.2f} mH unaligned, not saturated",
+        f" {magnetics.unaligned_inductance_H * 1e3:.2f} mH unaligned at small currents{_saturation(machine)}",
         f"  shaft       {machine.inertia_kg_m2:g} kg m^2, {machine.friction_Nm_s:g} N m s",
         f"  supply      {machine.supply_voltage_V:g} V"
         + (f" through {machine.dc_link['source_resistance_ohm']:g} ohm, link {machine.dc_link['capacitance_F'] * 1e6:g}"

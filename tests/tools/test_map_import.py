@@ -1,0 +1,132 @@
+"""Import of tables of flux linkages: layouts, units, corrections and refusals."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from salient.machine.file import load_machine
+from salient.machine.flux_map import FluxMapError
+from salient.machine.flux_map_csv import map_of_text
+from salient.machine.map_import.command import map_text
+from salient.machine.map_import.correct import Imported, Supply, correct
+from salient.machine.map_import.layouts import Points, points_of
+from salient.machine.map_import.mat import mat_points
+from salient.machine.map_import.text import blocks
+from salient.paths import MACHINES
+
+TRUTH = load_machine(MACHINES / "finite_element.toml").magnetics
+POLES, PHASES, PITCH_DEG = 6, 4, 60.0
+SUPPLY = Supply(240.0, 0.096)
+ANGLES_DEG = np.arange(0.0, 61.0)
+CURRENTS_A = np.arange(5.0, 81.0, 5.0)
+
+
+def flux(angles_deg=ANGLES_DEG, currents_A=CURRENTS_A, shift_deg: float = 0.0) -> np.ndarray:
+    return TRUTH.flux_linkage_Wb(np.radians(np.asarray(angles_deg) - shift_deg)[:, None], currents_A)
+
+
+def long_table(values: np.ndarray, header: str = "angle_deg,current_A,flux_linkage_Wb", separator: str = ",") -> str:
+    rows = [separator.join(f"{value:.9g}" for value in (angle, current, psi))
+            for angle, fluxes in zip(ANGLES_DEG, values, strict=True)
+            for current, psi in zip(CURRENTS_A, fluxes, strict=True)]
+    return "\n".join(([header] if header else []) + rows) + "\n"
+
+
+def matrix(values: np.ndarray, corner: str, separator: str = ",") -> str:
+    rows = [[corner, *(f"{current:g}" for current in CURRENTS_A)],
+            *([f"{angle:g}", *(f"{psi:.9g}" for psi in fluxes)] for angle, fluxes in zip(ANGLES_DEG, values, strict=True))]
+    return "\n".join(separator.join(row) for row in rows) + "\n"
+
+
+def imported(text: str) -> Imported:
+    return correct(points_of(blocks(text)), POLES, PHASES, SUPPLY)
+
+
+def deviation(of: Imported) -> float:
+    """Largest difference from the truth, of its largest flux linkage."""
+    expected = flux(of.angle_deg, of.current_A)
+    return float(np.max(np.abs(of.flux_Wb - expected)) / np.max(expected))
+
+
+def origin_of(of: Imported) -> tuple[float, float]:
+    found = re.search(r"aligned at (\S+) \+- (\S+) deg", "\n".join(of.lines))
+    return float(found[1]), float(found[2])
+
+
+VALUES = flux(shift_deg=0.5)
+MAXWELL = "\n".join([
+    ",".join(f"\"Moving1.Position [deg]\",\"FluxLinkage(A) [mWb] - I_aa='{current:g}A'\"" for current in CURRENTS_A),
+    *(",".join(f"{angle:g},{1e3 * psi:.9g}" for psi in fluxes) for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True))])
+FEMM = "\n".join(f"--> {angle:g}\t{current:g}\t{0.7 * current:.9g}\t{psi:.9g}"
+                 for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+                 for current, psi in zip(CURRENTS_A, fluxes, strict=True))
+LAYOUTS = {
+    "long table": long_table(VALUES),
+    "without a header, blanks": long_table(VALUES, "", " "),
+    "decimal comma": long_table(VALUES, "Winkel [deg];Strom [A];Fluss [Wb]", ";").replace(".", ","),
+    "tabs, mA and mWb": "theta (deg)\tI (mA)\tpsi (mWb)\n" + "\n".join(
+        f"{angle:g}\t{1e3 * current:g}\t{1e3 * psi:.9g}" for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+        for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+    "matrix, currents across": matrix(VALUES, ""),
+    "field solver's columns": MAXWELL,
+    "field solver's console": FEMM,
+    "electrical radians": "theta_elec_rad,current_A,flux_Wb\n" + "\n".join(
+        f"{math.radians(POLES * angle):.9g},{current:g},{psi:.9g}"
+        for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True) for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layout_is_found_and_its_origin_shifted(layout):
+    result = imported(LAYOUTS[layout])
+    aligned_deg, error_deg = origin_of(result)
+    assert abs(aligned_deg - 0.5) <= error_deg + 0.001 and error_deg < 0.1
+    assert deviation(result) < 5e-3
+    map_of_text(map_text(result, "table", 8, POLES), POLES)
+
+
+@pytest.mark.parametrize("shift_deg", [-2.0, -0.7, 0.0, 1.3, 2.0, 30.0, 47.0])
+def test_any_origin_is_stated_within_its_own_error(shift_deg):
+    result = imported(long_table(flux(shift_deg=shift_deg)))
+    aligned_deg, error_deg = origin_of(result)
+    assert abs(math.remainder(aligned_deg - shift_deg, PITCH_DEG)) <= error_deg + 0.001 and error_deg < 0.1
+    assert deviation(result) < 5e-3
+
+
+def test_phases_that_differ_are_averaged_and_their_spread_stated():
+    text = "".join(f"phase {name}\n" + long_table(factor * flux(shift_deg=0.5 + 15.0 * number))
+                   for number, (name, factor) in enumerate({"A": 0.97, "B": 1.0, "C": 1.03}.items()))
+    result = imported(text)
+    assert deviation(result) < 5e-3
+    spread = next(line for line in result.lines if line.startswith("spread"))
+    assert float(re.search(r"up to ([\d.]+) %", spread)[1]) == pytest.approx(100.0 * 0.06 / 1.03, abs=0.3)
+
+
+def test_mat_file_is_read_and_that_of_version_7_3_is_refused_in_a_line():
+    file = io.BytesIO()
+    savemat(file, {"RotorAngles": ANGLES_DEG, "StatorCurrents": CURRENTS_A, "FTBL": VALUES.T})
+    points: Points = mat_points(file.getvalue())
+    assert deviation(correct(points, POLES, PHASES, SUPPLY)) < 5e-3
+    with pytest.raises(FluxMapError, match=r"7\.3.*-v7"):
+        mat_points(b"MATLAB 7.3 MAT-file")
+
+
+def test_dip_is_refused_with_its_line():
+    values = flux()
+    values[0:4] *= 1.0 - 0.17 * np.array([1.0, 0.8, 0.5, 0.2])[:, None]
+    with pytest.raises(FluxMapError, match=r"^line \d+"):
+        imported(long_table(values))
+
+
+def test_direct_map_of_half_a_pitch_with_another_origin_is_refused_and_names_the_import():
+    saturating = load_machine(MACHINES / "saturating.toml").magnetics
+    rows = [f"{angle:g},{current:g},{float(saturating.flux_linkage_Wb(math.radians(angle - 1.0), current)):.9g}"
+            for angle in range(46) for current in range(5, 101, 5)]
+    with pytest.raises(FluxMapError, match=r"symmetric about 1\.0.*--import"):
+        map_of_text("\n".join(["angle_deg,current_A,flux_linkage_Wb", *rows]), 4)

@@ -1,0 +1,131 @@
+"""Where a table of flux linkages has its aligned position, found from the symmetry of the machine.
+
+Flux linkage is even about the aligned and about the unaligned position: at each current it is a sum of cosines of
+multiples of the electrical angle from there. The position is that of the least squares of such sums. A table of a whole
+pitch shows it by the difference of its halves, one of half a pitch by the slopes at its ends, which must be zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+# Cosines of a sum: more follow noise, fewer miss the corners where poles begin to overlap.
+HARMONICS_MAX = 12
+WHOLE_RAD = 1.5 * math.pi
+"""Tables over less than that have hardly a point whose mirror image is there, too."""
+_CANDIDATES = 180  # over half a pitch
+_PARTS = (0.1, 0.15, 0.2, 0.27)  # of half a pitch, at each of its ends
+_SIGHT_RAD = math.pi / 6.0  # in which the position is sought at an end
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Aligned position in electrical radians (a pitch is 2 pi), within half a pitch of 0, and its uncertainty: two
+    standard deviations, and how much the estimate depends on the form of the sums."""
+
+    aligned_rad: float
+    error_rad: float
+
+
+def find_origin(angle_rad: np.ndarray, flux: np.ndarray) -> Origin:
+    """The aligned position of rows at rising electrical angles, one column per current. At least 6 rows."""
+    scaled = flux / np.maximum(np.max(np.abs(flux), axis=0), 1e-300)
+    if angle_rad[-1] - angle_rad[0] >= WHOLE_RAD:
+        return _by_halves(angle_rad, scaled)
+    return _by_ends(angle_rad, scaled)
+
+
+def _by_halves(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
+    harmonics = min(HARMONICS_MAX, len(angle_rad) // 2 - 1)
+    step_rad = math.pi / _CANDIDATES
+    candidates = step_rad * np.arange(_CANDIDATES)
+    near_rad = float(candidates[np.argmin([_squares(at, angle_rad, scaled, harmonics) for at in candidates])])
+    least_rad, least, curvature = _least(near_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, harmonics))
+    fewer = max(2, harmonics // 2 + 1)
+    fewer_rad, *_ = _least(least_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, fewer))
+    deviation_rad = _deviation_rad(least, curvature, len(angle_rad) - harmonics - 2)
+    aligned_rad = _aligned(least_rad, angle_rad, scaled, harmonics)
+    return Origin(math.remainder(aligned_rad, 2.0 * math.pi), 2.0 * deviation_rad + abs(fewer_rad - least_rad))
+
+
+def _by_ends(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
+    """From even parabolas through the points near the aligned and near the unaligned position, half a pitch apart:
+    the mean of several widths and degrees, by their variances, and their scatter."""
+    total = np.sum(scaled, axis=1)
+    aligned_rad = float(angle_rad[np.argmax(total)])
+    way = 1.0 if float(angle_rad[np.argmin(total)]) > aligned_rad else -1.0
+    ends_rad = (aligned_rad, float(angle_rad[np.argmin(total)]))
+    found = []
+    for part in _PARTS:
+        chosen = [np.abs(angle_rad - end) <= part * math.pi for end in ends_rad]
+        for powers in (2, 3):
+            freedom = sum(int(np.sum(of)) for of in chosen) - 2 * powers - 1
+            if freedom < 1 or min(np.sum(of) for of in chosen) <= powers:
+                continue
+
+            def squares(at: float, chosen: list[np.ndarray] = chosen, powers: int = powers) -> float:
+                return sum(_even_squares(angle_rad[of] - at - end * way * math.pi, scaled[of], powers)
+                           for end, of in enumerate(chosen))
+
+            candidates = aligned_rad + np.linspace(-_SIGHT_RAD, _SIGHT_RAD, 31)
+            near_rad = float(candidates[np.argmin([squares(at) for at in candidates])])
+            least_rad, least, curvature = _least(near_rad, _SIGHT_RAD / 15.0, squares)
+            found.append((least_rad, max(2.0 * _deviation_rad(least, curvature, freedom), 1e-3)))
+    if not found:
+        return Origin(math.remainder(aligned_rad, 2.0 * math.pi), _SIGHT_RAD)
+    values, errors = np.array(found).T
+    weights = errors**-2.0 / np.sum(errors**-2.0)
+    mean_rad = float(weights @ values)
+    scatter_rad = math.sqrt(float(weights @ (values - mean_rad) ** 2))
+    step_rad = float(np.median(np.diff(angle_rad)))
+    unseen_rad = (0.1 if len(found) >= len(_PARTS) else 1.0) * step_rad  # few widths have no scatter to tell
+    return Origin(math.remainder(mean_rad, 2.0 * math.pi), float(np.min(errors)) + 2.0 * scatter_rad + unseen_rad)
+
+
+def _even_squares(angle_rad: np.ndarray, scaled: np.ndarray, powers: int) -> float:
+    """Sum of squares that even polynomials leave."""
+    basis = np.linalg.qr(np.power.outer(angle_rad / math.pi, 2 * np.arange(powers)))[0]
+    return float(np.sum((scaled - basis @ (basis.T @ scaled)) ** 2))
+
+
+def _deviation_rad(squares: float, curvature: float, freedom: int) -> float:
+    """Standard deviation of a position. The columns of a table err together: as if there were one."""
+    return math.sqrt(2.0 * squares / (max(1, freedom) * curvature)) if curvature > 0.0 else math.pi
+
+
+def _basis(at_rad: float, angle_rad: np.ndarray, harmonics: int) -> np.ndarray:
+    return np.cos(np.outer(angle_rad - at_rad, np.arange(harmonics + 1)))
+
+
+def _squares(at_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
+    """Sum of squares that even sums about a position leave."""
+    basis = _basis(at_rad, angle_rad, harmonics)
+    left, values, _ = np.linalg.svd(basis, full_matrices=False)
+    known = left[:, values > 1e-3 * values[0]]  # what the angles determine
+    return float(np.sum((scaled - known @ (known.T @ scaled)) ** 2))
+
+
+def _least(near_rad: float, step_rad: float, squares: Callable[[float], float]) -> tuple[float, float, float]:
+    """(position, sum of squares, its second derivative) of the minimum near a candidate, by parabolas."""
+    at_rad, curvature = near_rad, 0.0
+    for _ in range(6):
+        before, here, after = (squares(at_rad + way * step_rad) for way in (-1, 0, 1))
+        bend = before - 2.0 * here + after
+        if bend <= 0.0:
+            break
+        curvature = bend / step_rad**2
+        at_rad += float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) * step_rad
+        step_rad = max(0.4 * step_rad, 0.002)
+    return at_rad, squares(at_rad), curvature
+
+
+def _aligned(symmetric_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
+    """Of a position of symmetry and the one half a pitch away, the one of more flux linkage."""
+    basis = _basis(symmetric_rad, angle_rad, harmonics)
+    sums = np.linalg.lstsq(basis, np.sum(scaled, axis=1), rcond=1e-3)[0]
+    odd = float(np.sum(sums[1::2]))
+    return symmetric_rad if odd >= 0.0 else symmetric_rad + math.pi

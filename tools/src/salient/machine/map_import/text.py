@@ -1,0 +1,118 @@
+"""Splits a text of any separator, decimal sign and encoding into blocks of rows."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from salient.machine.flux_map import FluxMapError
+
+BYTES_MAX = 20_000_000
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+_MISSING = {"", "nan", "-", "--", "n/a", "na", "null"}
+_SEPARATORS = (";", "\t", ",", None)
+"""None: blanks. Of those that split equally many lines into numbers, the first."""
+
+
+@dataclass(frozen=True)
+class Row:
+    line: int
+    cells: tuple[str, ...]
+    values: tuple[float, ...]
+    """Cells as numbers; NaN where a cell is empty."""
+
+
+@dataclass
+class Block:
+    """Rows of numbers under the lines of text that precede them; the last of several cells is the header."""
+
+    titles: list[str] = field(default_factory=list)
+    header: tuple[str, ...] = ()
+    rows: list[Row] = field(default_factory=list)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file, of at most BYTES_MAX."""
+    try:
+        if not path.is_file():
+            raise FluxMapError("not a file" if path.exists() else "no such file")
+        if path.stat().st_size > BYTES_MAX:
+            raise FluxMapError(f"larger than {BYTES_MAX // 1_000_000} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise FluxMapError(f"cannot be read: {error.strerror}") from None
+
+
+def decode(data: bytes) -> str:
+    """UTF-8, UTF-16 with a byte order mark as spreadsheets write it, or a code page of Western Europe."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", errors="replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")
+
+
+def number(cell: str) -> float | None:
+    """A number with a decimal point or comma, NaN for a missing one, None for text."""
+    text = cell.strip().strip("'")
+    if text.lower() in _MISSING:
+        return float("nan")
+    if text.count(",") == 1 and "." not in text:
+        text = text.replace(",", ".")
+    if not _NUMBER.fullmatch(text):
+        return None
+    return float(re.sub("[dD]", "e", text))
+
+
+def blocks(text: str) -> list[Block]:
+    """The blocks of a text. A line of text after numbers begins a new one, and so does a blank line."""
+    lines = [re.sub(r"^\s*-->\s*", "", line) for line in text.splitlines()]  # FEMM's console
+    separator = max(_SEPARATORS, key=lambda by: sum(_is_numbers(_cells(line, by)) for line in lines))
+    found = [Block()]
+    for number_of, line in enumerate(lines, start=1):
+        stripped = line.strip()
+        comment = re.match(r"[#%!*]+|//", stripped)
+        if not stripped or comment:
+            if found[-1].rows:
+                found.append(Block())
+            if comment:
+                rest = stripped[comment.end():].strip()
+                _head(found[-1], rest, _cells(rest, separator), comment=True)
+            continue
+        cells = _cells(line, separator)
+        if _is_numbers(cells):
+            found[-1].rows.append(Row(number_of, tuple(cells), tuple(number(cell) or 0.0 for cell in cells)))
+            continue
+        if found[-1].rows:
+            found.append(Block())
+        _head(found[-1], stripped, cells, comment=False)
+    return [block for block in found if block.rows]
+
+
+def _head(block: Block, line: str, cells: Sequence[str], *, comment: bool) -> None:
+    if sum(1 for cell in cells if cell) > 1 and not (comment and block.header):
+        block.header = tuple(cells)
+    block.titles.append(line)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        if '"' in line:
+            return [quoted or plain for quoted, plain in re.findall(r'"([^"]*)"|(\S+)', line)]
+        return line.split()
+    cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    cells = [cell.strip() for cell in cells]
+    while len(cells) > 1 and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _is_numbers(cells: Sequence[str]) -> bool:
+    values = [number(cell) for cell in cells]
+    known = [value for value in values if value is not None and not math.isnan(value)]
+    return None not in values and len(cells) >= 2 and len(known) >= 2
