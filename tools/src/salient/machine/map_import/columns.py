@@ -40,7 +40,7 @@ def column(name: str) -> Column | None:
     plain = re.split(r"\s+-\s+\S+\s*=|\s*@", name)[0].strip().lower().replace("ω", "")
     units = [found.strip(" '\"") for found in re.findall(r"\[([^\]]*)\]|\(([^)]*)\)", plain) for found in found if found]
     tail = re.search(r"(?:[_/,:]|\bin\b|\s)\s*([^\s_/,:]+)$", plain)
-    candidates = [unit for unit in reversed(units)] + ([tail[1]] if tail else []) + [plain]
+    candidates = list(reversed(units)) + ([tail[1]] if tail else []) + [plain]
     base = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", plain).strip(" _")
     role = next((role for role, pattern in _NAMES if re.search(pattern, base)), None)
     for unit in candidates:

@@ -101,7 +101,7 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
     roles = [meaning.role if meaning else None for meaning in columns]
     conditions = [condition(cell) if re.search(r"\d", cell) else None for cell in block.header]
     stated = next((found for title in block.titles if (found := condition(title)) and (
-        (len(title) < 60 and not block.header) or title not in (" ".join(block.header),))), None)
+        (len(title) < 60 and not block.header) or title != " ".join(block.header))), None)
     if len(columns) == width and {"angle", "current", "flux"} <= set(roles):
         _long(points, block, columns, phase)
     elif len(columns) == width and sum(of is not None for of in conditions) >= 3:

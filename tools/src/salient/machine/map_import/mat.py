@@ -36,7 +36,7 @@ def mat_points(data: bytes) -> Points:
     fluxes = {name: (of, array) for name, (of, array) in found.items() if array.ndim in (2, 3)
               and not (of is not None and of.role == "other")}
     vectors = {name: (of, array) for name, (of, array) in found.items() if array.ndim == 1 and len(array) > 3}
-    for name, (flux, array) in sorted(fluxes.items(), key=lambda item: item[1][0] is None or item[1][0].role != "flux"):
+    for flux, array in sorted(fluxes.values(), key=lambda item: item[0] is None or item[0].role != "flux"):
         if (flux is None or flux.role == "flux") and (axes := _axes(array.shape, vectors)) is not None:
             return _matrix_points(array, flux, axes)
         if array.ndim == 2 and array.shape[1] in (3, 4) and flux is None:
