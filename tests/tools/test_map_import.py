@@ -40,7 +40,8 @@ def long_table(values: np.ndarray, header: str = "angle_deg,current_A,flux_linka
 
 def matrix(values: np.ndarray, corner: str, separator: str = ",") -> str:
     rows = [[corner, *(f"{current:g}" for current in CURRENTS_A)],
-            *([f"{angle:g}", *(f"{psi:.9g}" for psi in fluxes)] for angle, fluxes in zip(ANGLES_DEG, values, strict=True))]
+            *([f"{angle:g}", *(f"{psi:.9g}" for psi in fluxes)]
+              for angle, fluxes in zip(ANGLES_DEG, values, strict=True))]
     return "\n".join(separator.join(row) for row in rows) + "\n"
 
 
@@ -62,7 +63,8 @@ def origin_of(of: Imported) -> tuple[float, float]:
 VALUES = flux(shift_deg=0.5)
 MAXWELL = "\n".join([
     ",".join(f"\"Moving1.Position [deg]\",\"FluxLinkage(A) [mWb] - I_aa='{current:g}A'\"" for current in CURRENTS_A),
-    *(",".join(f"{angle:g},{1e3 * psi:.9g}" for psi in fluxes) for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True))])
+    *(",".join(f"{angle:g},{1e3 * psi:.9g}" for psi in fluxes)
+      for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True))])
 FEMM = "\n".join(f"--> {angle:g}\t{current:g}\t{0.7 * current:.9g}\t{psi:.9g}"
                  for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
                  for current, psi in zip(CURRENTS_A, fluxes, strict=True))
@@ -78,7 +80,8 @@ LAYOUTS = {
     "field solver's console": FEMM,
     "electrical radians": "theta_elec_rad,current_A,flux_Wb\n" + "\n".join(
         f"{math.radians(POLES * angle):.9g},{current:g},{psi:.9g}"
-        for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True) for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+        for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+        for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
 }
 
 

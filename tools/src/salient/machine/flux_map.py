@@ -48,8 +48,8 @@ MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest fl
 RISE_TOLERANCE = 0.05  # above the inductance at lower currents, of the map's greatest flux linkage
 REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of that of the others
 
-# From which the aligned position that the symmetry shows is another than 0, in electrical degrees, if it is more than its
-# uncertainty: 0.42 deg of an 8/6.
+# From which the aligned position that the symmetry shows is another than 0, if it is more than its uncertainty, too;
+# electrical: 0.42 deg of an 8/6.
 ORIGIN_TOLERANCE_RAD = math.radians(2.5)
 
 IMPORT_HINT = "tools/salient machine MACHINE --import FILE shifts, symmetrises and resamples a map"
@@ -195,8 +195,8 @@ def _check_origin(curves: Sequence[Curve], flux_Wb: np.ndarray, rotor_poles: int
     if abs(origin.aligned_rad) > max(ORIGIN_TOLERANCE_RAD, 1.5 * origin.error_rad):
         aligned_deg, error_deg = (math.degrees(of) / rotor_poles for of in (origin.aligned_rad, origin.error_rad))
         raise FluxMapError(
-            f"line {curves[0].lines[0]}: the map is symmetric about {aligned_deg:.3f} +- {error_deg:.3f} deg, not about 0"
-            f" (aligned): {IMPORT_HINT}"
+            f"line {curves[0].lines[0]}: the map is symmetric about {aligned_deg:.3f} +- {error_deg:.3f} deg, not"
+            f" about 0 (aligned): {IMPORT_HINT}"
         )
 
 
@@ -271,13 +271,16 @@ def _check_fall_in(order: Sequence[int], curves: Sequence[Curve], flux_Wb: np.nd
         )
 
 
-def _check_mirror(curves: Sequence[Curve], grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndarray) -> None:
-    """The halves of a whole pitch agree. Named are the points of the file that are nearest to the largest difference."""
+def _check_mirror(curves: Sequence[Curve], grid_Wb: np.ndarray, angle_rad: np.ndarray, current_A: np.ndarray
+                  ) -> None:
+    """Checks that the halves of a whole pitch agree. The message names the points of the file that are nearest to the
+    largest difference."""
     difference_Wb = np.abs(grid_Wb - grid_Wb[::-1])
     row, column = np.unravel_index(np.argmax(difference_Wb), difference_Wb.shape)
     worst_Wb = float(difference_Wb[row, column])
     if worst_Wb > MIRROR_TOLERANCE * np.max(grid_Wb):
-        nearest = [min(curves, key=lambda curve, at=angle_rad[at]: abs(curve.angle_rad - at)) for at in (row, -1 - row)]
+        given_rad = np.array([curve.angle_rad for curve in curves])
+        nearest = [curves[int(np.argmin(np.abs(given_rad - angle_rad[at])))] for at in (row, -1 - row)]
         places = " and ".join(f"line {_nearest_line(curve, current_A[column])} ({_degrees(curve.angle_rad)} deg)"
                               for curve in nearest)
         raise FluxMapError(
@@ -294,9 +297,8 @@ def _check_model(model: FluxMap, curves: Sequence[Curve]) -> None:
         nearest = min(curves, key=lambda curve: abs(curve.angle_rad - angle_rad))
         raise FluxMapError(
             f"line {_nearest_line(nearest, current_A)}: the curve through the points has an incremental inductance of"
-            f" {least_H:.3g} H near {_degrees(nearest.angle_rad)} deg and {_nearest_current(nearest, current_A):.5g} A; it"
-            " must be at least"
-            f" {INDUCTANCE_MIN_H:g} H: the points there are too uneven, or in another unit"
+            f" {least_H:.3g} H near {_degrees(nearest.angle_rad)} deg and {_nearest_current(nearest, current_A):.5g} A;"
+            f" it must be at least {INDUCTANCE_MIN_H:g} H: the points there are too uneven, or in another unit"
         )
     allowed_Wb = MISS_TOLERANCE * max(curve.flux_linkage_Wb[-1] for curve in curves)
     for curve in curves:

@@ -66,7 +66,8 @@ def _points(text: str) -> list[Point]:
         raise FluxMapError(f"no header; must be {_header_names()}")
     line, header = rows[0]
     if len(header) != len(_COLUMNS) or any(name not in allowed for name, allowed in zip(header, _COLUMNS, strict=True)):
-        raise FluxMapError(f"line {line}: {','.join(header)!r:.100}: the header must be {_header_names()}: {IMPORT_HINT}")
+        raise FluxMapError(f"line {line}: {','.join(header)!r:.100}: the header must be {_header_names()}:"
+                           f" {IMPORT_HINT}")
     factors = [allowed[name] for name, allowed in zip(header, _COLUMNS, strict=True)]
     return [(line, *_numbers(line, cells, header, factors)) for line, cells in rows[1:]]
 

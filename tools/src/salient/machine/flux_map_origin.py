@@ -98,7 +98,8 @@ def _deviation_rad(squares: float, curvature: float, freedom: int) -> float:
 
 
 def _basis(at_rad: float, angle_rad: np.ndarray, harmonics: int) -> np.ndarray:
-    return np.cos(np.outer(angle_rad - at_rad, np.arange(harmonics + 1)))
+    basis: np.ndarray = np.cos(np.outer(angle_rad - at_rad, np.arange(harmonics + 1)))
+    return basis
 
 
 def _squares(at_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
@@ -124,7 +125,7 @@ def _least(near_rad: float, step_rad: float, squares: Callable[[float], float]) 
 
 
 def _aligned(symmetric_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
-    """Of a position of symmetry and the one half a pitch away, the one of more flux linkage."""
+    """The position of more flux linkage: that of symmetry, or the one half a pitch away."""
     basis = _basis(symmetric_rad, angle_rad, harmonics)
     sums = np.linalg.lstsq(basis, np.sum(scaled, axis=1), rcond=1e-3)[0]
     odd = float(np.sum(sums[1::2]))

@@ -10,11 +10,11 @@ _ANGLE = {"deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": 
           "radians": "rad", "mrad": "mrad", "mdeg": "mdeg"}
 _CURRENT = {"a": 1.0, "amp": 1.0, "amps": 1.0, "ampere": 1.0, "amperes": 1.0, "ma": 1e-3, "ka": 1e3}
 _FLUX = {name: factor for prefix, factor in (("", 1.0), ("m", 1e-3), ("u", 1e-6), ("µ", 1e-6), ("μ", 1e-6))
-         for name in (f"{prefix}wb", f"{prefix}vs", f"{prefix}v.s", f"{prefix}v*s", f"{prefix}v s", f"{prefix}v-s",
-                      f"{prefix}wb-turns", f"{prefix}wb-turn", f"{prefix}wb-t", f"{prefix}wbt", f"{prefix}wb turns",
-                      f"{prefix}wb.turns", f"{prefix}webers", f"{prefix}weber")}
-_OTHER = {"s", "ms", "us", "ns", "v", "mv", "h", "mh", "uh", "nm", "n.m", "n m", "mnewtonmeter", "newtonmeter", "j", "mj",
-          "w", "t", "ohm", "hz", "rpm", "kg"}
+         for name in (prefix + unit for unit in (
+             "wb", "vs", "v.s", "v*s", "v s", "v-s", "wb-turns", "wb-turn", "wb-t", "wbt", "wb turns", "wb.turns",
+             "webers", "weber"))}
+_OTHER = {"s", "ms", "us", "ns", "v", "mv", "h", "mh", "uh", "nm", "n.m", "n m", "mnewtonmeter", "newtonmeter", "j",
+          "mj", "w", "t", "ohm", "hz", "rpm", "kg"}
 _NAMES = (
     ("phase", r"^(phase|ph|winding|coil|strang)(_?(no|nr|number|id))?$"),
     ("other", r"torque|drehmoment|^time|^t$|volt|induct|co-?energy|energie|loss|speed|^l_|^mm"),
@@ -38,7 +38,8 @@ class Column:
 def column(name: str) -> Column | None:
     """The meaning of a column by its header; None where it has none that is known."""
     plain = re.split(r"\s+-\s+\S+\s*=|\s*@", name)[0].strip().lower().replace("ω", "")
-    units = [found.strip(" '\"") for found in re.findall(r"\[([^\]]*)\]|\(([^)]*)\)", plain) for found in found if found]
+    bracketed = re.findall(r"\[([^\]]*)\]|\(([^)]*)\)", plain)
+    units = [unit.strip(" '\"") for pair in bracketed for unit in pair if unit]
     tail = re.search(r"(?:[_/,:]|\bin\b|\s)\s*([^\s_/,:]+)$", plain)
     candidates = list(reversed(units)) + ([tail[1]] if tail else []) + [plain]
     base = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", plain).strip(" _")

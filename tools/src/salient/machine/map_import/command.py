@@ -63,15 +63,17 @@ def map_text(imported: Imported, source: str, stator_poles: int, rotor_poles: in
     rows = [f"{angle:.9g},{current:.9g},{flux:.9g}"
             for angle, fluxes in zip(imported.angle_deg, imported.flux_Wb, strict=True)
             for current, flux in zip(imported.current_A, fluxes, strict=True)]
-    head = [f"# Imported from {source!r} by tools/salient machine --import, for {stator_poles}/{rotor_poles} poles."]
-    return "\n".join([*head, *(f"# {line}" for line in imported.lines), "angle_deg,current_A,flux_linkage_Wb", *rows, ""])
+    head = [f"Imported from {source!r} by tools/salient machine --import, for {stator_poles}/{rotor_poles} poles."]
+    comments = [f"# {line}" for line in [*head, *imported.lines]]
+    return "\n".join([*comments, "angle_deg,current_A,flux_linkage_Wb", *rows, ""])
 
 
 def with_map(source: str, data: dict[str, Any], map_name: str, table_name: str) -> str:
     """The text of a machine file with a map for its table [magnetics]; the rest as it is, comments included."""
     magnetics = (f"[magnetics] # map imported from {table_name!r}, corrections: top of {map_name}\n"
                  f'form = "map"\nfile = "{map_name}"\n')
-    text, count = re.subn(r"(?ms)^[ \t]*\[[ \t]*magnetics[ \t]*\].*?(?=^[ \t]*\[|\Z)", lambda _: magnetics + "\n", source)
+    text, count = re.subn(r"(?ms)^[ \t]*\[[ \t]*magnetics[ \t]*\].*?(?=^[ \t]*\[|\Z)", lambda _: magnetics + "\n",
+                          source)
     if count == 0:
         text = f"{source.rstrip()}\n\n{magnetics}"
     try:

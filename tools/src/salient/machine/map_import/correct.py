@@ -1,17 +1,17 @@
 """Makes a legal map of points as they come, and says by how much each correction was.
 
-1. units: angles by the period that the map then has; currents and flux linkages without a unit by what the supply and the
-   resistance of the machine permit;
+1. units: angles by the period that the map then has; currents and flux linkages without a unit by what the supply and
+   the resistance of the machine permit;
 2. the aligned position of each phase by symmetry (flux_map_origin.py), phases a stroke apart;
 3. on a common grid, mean of the halves of the pitch, and of the phases;
 4. flux linkage falls from aligned to unaligned and rises with the current: the nearest one that does (isotonic
    regression).
 
-Beyond LIMITS a correction is not one of a measurement any more, and the map is refused. A measurement repeats within a
-percent or two; tolerances of the air gap, of a few percent each, and end effects make halves and phases differ by up to
-some 6 % in published maps. Twice that and more is a second machine, a wrong column or an outlier: the mean of such curves
-would be the map of no machine. A curve that has to be changed by more than 4 % of the aligned flux linkage to be monotonic
-has a dip or a step: its torque would have the wrong sign there.
+Beyond its limit a correction is not one of a measurement any more, and the map is refused. A measurement repeats within
+a percent or two; tolerances of the air gap, of a few percent each, and end effects make halves and phases differ by up
+to some 6 % in published maps. Twice that and more is a second machine, a wrong column or an outlier: the mean of such
+curves would be the map of no machine. A curve that has to be changed by more than 4 % of the aligned flux linkage to be
+monotonic has a dip or a step: its torque would have the wrong sign there.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def correct(points: Points, rotor_poles: int, phases: int, supply: Supply) -> Im
 
     _compare_halves(halves, most_Wb, current_A, place, lines)
     means = [np.mean([half for half in both if half is not None], axis=0) for both in halves]
-    _compare_phases(means, most_Wb, current_A, lambda phase, *at: place(phase, halves[phase][0] is None, *at), lines)
+    _compare_phases(means, most_Wb, current_A,
+                    lambda phase, row, column: place(phase, int(halves[phase][0] is None), row, column), lines)
     repairs = []
     for phase, both in enumerate(halves):
         for half, flux_Wb in enumerate(both):
@@ -97,8 +98,8 @@ def correct(points: Points, rotor_poles: int, phases: int, supply: Supply) -> Im
                 repairs.append(_check_monotonic(flux_Wb, current_A, partial(place, phase, half)))
     flux_Wb = _monotonic(np.mean(means, axis=0), current_A)
     lines.append(f"monotonic: curves changed by up to {100.0 * max(repairs):.2f} % of the aligned flux linkage")
-    lines.append(f"grid: {len(grid_rad)} angles from 0 to {pitch_deg / 2.0:.6g} deg, {len(current_A)} currents from 0 to"
-                 f" {current_A[-1]:.6g} A")
+    lines.append(f"grid: {len(grid_rad)} angles from 0 to {pitch_deg / 2.0:.6g} deg, {len(current_A)} currents from 0"
+                 f" to {current_A[-1]:.6g} A")
     return Imported(np.degrees(grid_rad) / rotor_poles, current_A, flux_Wb, lines)
 
 
@@ -139,8 +140,9 @@ def _in_radians(table: np.ndarray, unit: str | None, rotor_poles: int) -> tuple[
         changed = table.copy()
         changed[:, 2] *= radians(candidate, rotor_poles)
         misfit = _misfit(changed)
-        if misfit is not None and (best is None or misfit < (0.5 if candidate.startswith("electrical") and unit else 1.0)
-                                   * best[0]):
+        # Against the name of the unit, which says mechanical, electrical ones must fit much better.
+        weight = 2.0 if candidate.startswith("electrical") and unit else 1.0
+        if misfit is not None and (best is None or weight * misfit < best[0]):
             best = (misfit, changed, candidate)
     if best is None:
         low, high = float(np.min(table[:, 2])), float(np.max(table[:, 2]))
@@ -180,9 +182,8 @@ def _misfit(table: np.ndarray) -> float | None:
 def _curves(table: np.ndarray, lines: list[str]) -> tuple[np.ndarray, list[_Phase]]:
     """Common currents from 0 A on, and the curves of each phase at them; without the flux linkage at 0 A."""
     names = np.unique(table[:, 1])
-    groups = [[(at, table[(table[:, 1] == name) & (table[:, 2] == at)]) for at in np.unique(table[table[:, 1] == name, 2])]
-              for name in names]
-    curves = [[(at, *_curve(rows)) for at, rows in group] for group in groups]
+    tables = [table[table[:, 1] == name] for name in names]
+    curves = [[(at, *_curve(rows[rows[:, 2] == at])) for at in np.unique(rows[:, 2])] for rows in tables]
     every = [curve for group in curves for curve in group]
     for _, current_A, _, line in every:
         if len(current_A) < CURRENTS_MIN + 1:
@@ -192,8 +193,8 @@ def _curves(table: np.ndarray, lines: list[str]) -> tuple[np.ndarray, list[_Phas
     longest = max(every, key=lambda curve: len(curve[1]))
     if least_A < 0.9 * max(float(current_A[-1]) for _, current_A, _, _ in every):
         short = min(every, key=lambda curve: float(curve[1][-1]))
-        raise FluxMapError(f"line {short[3][-1]}: the currents end at {short[1][-1]:.6g} A there; at every angle they must"
-                           " reach the same greatest current within 10 %")
+        raise FluxMapError(f"line {short[3][-1]}: the currents end at {short[1][-1]:.6g} A there; at every angle they"
+                           " must reach the same greatest current within 10 %")
     current_A = longest[1][longest[1] < 0.999 * least_A]
     current_A = np.append(current_A, least_A)
     if any(len(of) != len(longest[1]) or np.max(np.abs(of - longest[1])) > 1e-6 * least_A for _, of, _, _ in every):
@@ -202,8 +203,8 @@ def _curves(table: np.ndarray, lines: list[str]) -> tuple[np.ndarray, list[_Phas
     phases = []
     for name, group in zip(names, curves, strict=True):
         if len(group) < ANGLES_MIN:
-            raise FluxMapError(f"line {group[0][3][0]}: {len(group)} angles of phase {int(name) + 1}; must be at least"
-                               f" {ANGLES_MIN}")
+            raise FluxMapError(f"line {group[0][3][0]}: {len(group)} angles of phase {int(name) + 1}; must be at"
+                               f" least {ANGLES_MIN}")
         flux_Wb = np.array([_at_currents(of, flux, current_A) for _, of, flux, _ in group])
         line = np.array([lines_of[np.argmin(np.abs(np.subtract.outer(current_A, of)), axis=1)]
                          for _, of, _, lines_of in group])
@@ -228,7 +229,8 @@ def _at_currents(current_A: np.ndarray, flux_Wb: np.ndarray, wanted_A: np.ndarra
     return read
 
 
-def _say_offset(table: np.ndarray, curves: Sequence[tuple[float, np.ndarray, np.ndarray, np.ndarray]], lines: list[str]) -> None:
+def _say_offset(table: np.ndarray, curves: Sequence[tuple[float, np.ndarray, np.ndarray, np.ndarray]],
+                lines: list[str]) -> None:
     zero = table[table[:, 3] == 0.0]
     if len(zero) == 0:
         lines.append("0 A: added")
@@ -237,8 +239,8 @@ def _say_offset(table: np.ndarray, curves: Sequence[tuple[float, np.ndarray, np.
     at = int(np.argmax(np.abs(zero[:, 4])))
     offset = abs(float(zero[at, 4])) / most_Wb
     if offset > OFFSET_MAX:
-        raise FluxMapError(f"line {int(zero[at, 0])}: the flux linkage at 0 A is {zero[at, 4]:.4g} Wb; it must be 0 within"
-                           f" {OFFSET_MAX:.0%} of the map's largest")
+        raise FluxMapError(f"line {int(zero[at, 0])}: the flux linkage at 0 A is {zero[at, 4]:.4g} Wb; it must be 0"
+                           f" within {OFFSET_MAX:.0%} of the map's largest")
     if offset > 0.0:
         lines.append(f"offset: up to {100.0 * offset:.2f} % of the largest flux linkage at 0 A, taken off")
 
@@ -254,8 +256,8 @@ def _origin(phase: _Phase) -> Origin:
     return origin
 
 
-def _say_origin(measured: Sequence[_Phase], origins: Sequence[Origin], pitch_deg: float, phases: int, lines: list[str]
-                ) -> None:
+def _say_origin(measured: Sequence[_Phase], origins: Sequence[Origin], pitch_deg: float, phases: int,
+                lines: list[str]) -> None:
     """The aligned position of every phase, and how far it is from its place a stroke after another."""
     deg = pitch_deg / (2.0 * math.pi)
     shown = ", ".join(f"{deg * origin.aligned_rad:.3f} +- {deg * origin.error_rad:.3f}" for origin in origins)
@@ -272,8 +274,8 @@ def _say_origin(measured: Sequence[_Phase], origins: Sequence[Origin], pitch_deg
         error_rad = origins[0].error_rad + origins[at].error_rad
         if abs(worst_rad) > 2.0 * math.pi * PLACE_MAX + error_rad:
             raise FluxMapError(f"line {measured[at].line[0, 0]}: the aligned position of phase {at + 1} is"
-                               f" {deg * worst_rad:.3f} deg from its place a multiple of a stroke after phase 1; must be"
-                               f" within {PLACE_MAX:.0%} of a pitch")
+                               f" {deg * worst_rad:.3f} deg from its place a multiple of a stroke after phase 1; must"
+                               f" be within {PLACE_MAX:.0%} of a pitch")
         lines.append(f"phases: {len(origins)}, their aligned positions up to {abs(deg * worst_rad):.3f} deg from their"
                      " place")
 
@@ -282,8 +284,9 @@ def _halves(phase: _Phase, origin: Origin, grid_rad: np.ndarray) -> tuple[np.nda
     """Flux linkage from aligned to unaligned after and before the aligned position; None where points are missing."""
     both = [_half(phase, origin.aligned_rad, way, grid_rad) for way in (1.0, -1.0)]
     if both[0] is None and both[1] is None:
-        raise FluxMapError(f"line {phase.line[0, 0]}: the angles leave more than {GAP_RAD / math.pi:.0%} of half a pitch"
-                           " without points, or end more than that from the aligned and from the unaligned position")
+        raise FluxMapError(f"line {phase.line[0, 0]}: the angles leave more than {GAP_RAD / math.pi:.0%} of half a"
+                           " pitch without points, or end more than that from the aligned and from the unaligned"
+                           " position")
     return both[0], both[1]
 
 
@@ -313,8 +316,8 @@ def _half(phase: _Phase, aligned_rad: float, way: float, grid_rad: np.ndarray) -
     return read
 
 
-def _compare_halves(halves: Sequence[tuple[np.ndarray | None, np.ndarray | None]], most_Wb: float, current_A: np.ndarray,
-                    place: Callable[[int, int, int, int], str], lines: list[str]) -> None:
+def _compare_halves(halves: Sequence[tuple[np.ndarray | None, np.ndarray | None]], most_Wb: float,
+                    current_A: np.ndarray, place: Callable[[int, int, int, int], str], lines: list[str]) -> None:
     worst, told = 0.0, ""
     for phase, (after, before) in enumerate(halves):
         if after is None or before is None:
@@ -323,19 +326,20 @@ def _compare_halves(halves: Sequence[tuple[np.ndarray | None, np.ndarray | None]
         row, column = np.unravel_index(int(np.argmax(difference)), difference.shape)
         if difference[row, column] >= worst:
             worst = float(difference[row, column])
-            told = f"{place(phase, 0, int(row), int(column))} and {place(phase, 1, int(row), int(column))}, {current_A[column]:.5g} A"
+            lines_of = " and ".join(place(phase, half, int(row), int(column)) for half in (0, 1))
+            told = f"{lines_of}, {current_A[column]:.5g} A"
     if not told:
         lines.append("asymmetry: unknown, half a pitch")
         return
     if worst > ASYMMETRY_MAX:
-        raise FluxMapError(f"{told}: the halves of the pitch differ by {100.0 * worst:.1f} % of the largest flux linkage;"
-                           f" must be within {ASYMMETRY_MAX:.0%}")
+        raise FluxMapError(f"{told}: the halves of the pitch differ by {100.0 * worst:.1f} % of the largest flux"
+                           f" linkage; must be within {ASYMMETRY_MAX:.0%}")
     lines.append(f"asymmetry: the halves of the pitch differ by up to {100.0 * worst:.2f} % of the largest flux linkage"
                  f" ({told}); their mean is used")
 
 
-def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.ndarray, place: Callable[[int, int, int], str],
-                    lines: list[str]) -> None:
+def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.ndarray,
+                    place: Callable[[int, int, int], str], lines: list[str]) -> None:
     if len(means) < 2:
         return
     spread = np.ptp(np.array(means), axis=0) / most_Wb
@@ -344,8 +348,8 @@ def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.n
     told = f"{place(int(np.argmax(away)), int(row), int(column))}, {current_A[column]:.5g} A"
     worst = float(spread[row, column])
     if worst > SPREAD_MAX:
-        raise FluxMapError(f"{told}: the phases differ by {100.0 * worst:.1f} % of the largest flux linkage; must be within"
-                           f" {SPREAD_MAX:.0%}")
+        raise FluxMapError(f"{told}: the phases differ by {100.0 * worst:.1f} % of the largest flux linkage; must be"
+                           f" within {SPREAD_MAX:.0%}")
     lines.append(f"spread: the phases differ by up to {100.0 * worst:.2f} % of the largest flux linkage ({told}); their"
                  " mean is used")
 
@@ -371,9 +375,9 @@ def _check_monotonic(flux_Wb: np.ndarray, current_A: np.ndarray, place: Callable
     worst = float(changed[row, column])
     if worst > REPAIR_MAX:
         raise FluxMapError(
-            f"{place(int(row), int(column) + 1)}, {current_A[column + 1]:.5g} A: the flux linkage does not fall from aligned to unaligned,"
-            f" or not rise with the current: a dip or a step of {200.0 * worst:.1f} % of the aligned flux linkage; must"
-            f" be within {2.0 * REPAIR_MAX:.0%}")
+            f"{place(int(row), int(column) + 1)}, {current_A[column + 1]:.5g} A: the flux linkage does not fall from"
+            f" aligned to unaligned, or not rise with the current: a dip or a step of {200.0 * worst:.1f} % of the"
+            f" aligned flux linkage; must be within {2.0 * REPAIR_MAX:.0%}")
     return worst
 
 

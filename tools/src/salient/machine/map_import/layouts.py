@@ -1,5 +1,5 @@
-"""Makes points of the blocks of a text: long tables, matrices, columns by current as field solvers export them, blocks by
-current and by phase."""
+"""Makes points of the blocks of a text: long tables, matrices, columns by current as field solvers export them, blocks
+by current and by phase."""
 
 from __future__ import annotations
 
@@ -141,20 +141,21 @@ def _by_condition(points: Points, block: Block, columns: Sequence[Column | None]
     """A column of flux linkage for each current (or angle) that its header states, the other one in a column to the
     left. The same condition twice is another phase."""
     points.layout = points.layout or "a column for each current or angle, stated in its header"
+    roles = [meaning.role if meaning else None for meaning in columns]
     seen: dict[float, int] = {}
     free = [at for at, of in enumerate(conditions) if of is None]
     for at, stated in enumerate(conditions):
-        if stated is None or (columns[at] is not None and columns[at].role not in ("flux", stated[0].role)):
+        if stated is None or roles[at] not in (None, "flux", stated[0].role):
             continue
         meaning, value = stated
         wanted = "angle" if meaning.role == "current" else "current"
         lefts = [left for left in free if left < at]
-        named = [left for left in lefts if columns[left] is not None and columns[left].role == wanted]
-        lefts = named or [left for left in lefts if columns[left] is None or columns[left].role != "other"]
+        named = [left for left in lefts if roles[left] == wanted]
+        lefts = named or [left for left in lefts if roles[left] != "other"]
         if not lefts:
             raise FluxMapError(f"line {block.rows[0].line}: no column of the {wanted} left of {block.header[at]!r:.60}")
         left = columns[lefts[-1]]
-        flux = columns[at] if columns[at] is not None and columns[at].role == "flux" else None
+        flux = columns[at] if roles[at] == "flux" else None
         angle, current = (left, meaning) if wanted == "angle" else (meaning, left)
         current_factor, flux_factor = points.units(angle, current, flux)
         own = phase + seen.get(value, 0)
@@ -200,8 +201,8 @@ def _bare_matrix(points: Points, block: Block, phase: int) -> None:
         if len(block.rows[0].values) > 3 and len({row.values[0] for row in block.rows}) < 0.5 * len(block.rows):
             _bare_long(points, block, phase)
             return
-        raise FluxMapError(f"line {block.rows[0].line}: the first row and the first column of a matrix must be its rising"
-                           " currents and angles")
+        raise FluxMapError(f"line {block.rows[0].line}: the first row and the first column of a matrix must be its"
+                           " rising currents and angles")
     head = block.rows[0].values
     head = head[1:] if len(head) == len(block.rows[1].values) else head
     _matrix(points, head, block.rows[1:], " ".join([*block.titles, *block.header]), phase)
@@ -264,7 +265,7 @@ def _multiple(of: np.ndarray, values: np.ndarray) -> bool:
 
 
 def _like_flux(values: np.ndarray) -> bool:
-    """Of one sign: a torque has two, or is 0 at both ends."""
+    """Whether values have one sign: a torque has two, or is 0 at both ends."""
     most = float(np.max(np.abs(values)))
     return most > 0.0 and bool(np.all(values >= -0.02 * most) or np.all(values <= 0.02 * most))
 

@@ -1,4 +1,5 @@
-"""Makes points of a MAT file: vectors of angles and currents with a matrix of flux linkages, or columns of equal length."""
+"""Makes points of a MAT file: vectors of angles and currents with a matrix of flux linkages, or columns of equal
+length."""
 
 from __future__ import annotations
 

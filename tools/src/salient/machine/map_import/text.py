@@ -15,7 +15,7 @@ BYTES_MAX = 20_000_000
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MISSING = {"", "nan", "-", "--", "n/a", "na", "null"}
 _SEPARATORS = (";", "\t", ",", None)
-"""None: blanks. Of those that split equally many lines into numbers, the first."""
+"""None: blanks. The first of those that split equally many lines into numbers is used."""
 
 
 @dataclass(frozen=True)
