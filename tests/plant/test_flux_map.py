@@ -344,7 +344,7 @@ REJECTED = {
     "0 degrees unaligned": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda angle, current, _: float(
             formula("saturating").flux_linkage_Wb(math.radians(HALF_DEG - angle), current))),
-        ["must fall", "aligned (0 deg)", "line "],
+        ["must fall", "aligned (0 deg)", "line ", "--import"],
     ),
     "a bump over the angle": (
         sampled_file(REGULAR_DEG, REGULAR_A, lambda angle, _, flux: flux * (1.4 if 20 < angle < 22 else 1.0)),

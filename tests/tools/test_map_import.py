@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from salient.experiments.compare.random_maps import random_map
 from salient.machine.file import load_machine
-from salient.machine.flux_map import FluxMapError
+from salient.machine.flux_map import ORIGIN_ERRORS, ORIGIN_TOLERANCE_RAD, FluxMapError
 from salient.machine.flux_map_csv import map_of_text
+from salient.machine.flux_map_origin import find_origin
 from salient.machine.map_import.command import map_text
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
@@ -135,3 +137,13 @@ def test_direct_map_of_half_a_pitch_with_another_origin_is_refused_and_names_the
         map_of_text("\n".join(["angle_deg,current_A,flux_linkage_Wb", *rows]), 4)
     aligned_deg, error_deg = map(float, re.search(r"about (\S+) \+- (\S+) deg", str(refusal.value)).groups())
     assert abs(aligned_deg - 1.0) <= error_deg < 0.5
+
+
+@pytest.mark.parametrize("every", [4, 6, 8])
+def test_coarse_half_pitch_of_narrow_poles_keeps_its_origin_within_its_own_error(every):
+    """Corners where poles begin to overlap look like a shift where few points are between them and the end."""
+    for number in range(30):
+        rows = np.array([row.split(",") for row in random_map(number)[1].split()[1:]], dtype=float)
+        values = rows[:, 2].reshape(97, -1)[::every]
+        origin = find_origin(np.linspace(0.0, math.pi, len(values)), values)
+        assert abs(origin.aligned_rad) <= max(ORIGIN_TOLERANCE_RAD, ORIGIN_ERRORS * origin.error_rad), number

@@ -48,9 +48,10 @@ MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest fl
 RISE_TOLERANCE = 0.05  # above the inductance at lower currents, of the map's greatest flux linkage
 REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of that of the others
 
-# From which the aligned position that the symmetry shows is another than 0, if it is more than its uncertainty, too;
-# electrical: 0.42 deg of an 8/6.
+# From which the aligned position that the symmetry shows is another than 0, electrical (0.42 deg of an 8/6), if it is
+# more than that many times its uncertainty, too: noise and corners of narrow poles look like a shift of half a pitch.
 ORIGIN_TOLERANCE_RAD = math.radians(2.5)
+ORIGIN_ERRORS = 3.0
 
 IMPORT_HINT = "tools/salient machine MACHINE --import FILE shifts, symmetrises and resamples a map"
 
@@ -169,8 +170,8 @@ def fit(curves: Sequence[Curve], rotor_poles: int, file: Path | None = None) -> 
     current_max_A = _common_current_A(curves)
     current_A = np.linspace(0.0, current_max_A, CURRENT_INTERVALS + 1)
     flux_Wb = np.array([_read_curve(curve, current_A) for curve in curves])
-    _check_origin(curves, flux_Wb, rotor_poles)
     _check_fall(curves, flux_Wb, half_rad, current_A)
+    _check_origin(curves, flux_Wb, rotor_poles)
 
     angle_rad = np.array([curve.angle_rad for curve in curves])
     uniform_rad = np.linspace(0.0, angle_rad[-1], (2 if whole else 1) * ANGLE_INTERVALS + 1)
@@ -192,7 +193,7 @@ def _check_origin(curves: Sequence[Curve], flux_Wb: np.ndarray, rotor_poles: int
     """The aligned position, where the map is symmetric, is at 0. Half a pitch shows it by the slopes at its ends."""
     angle_rad = np.array([curve.angle_rad for curve in curves])
     origin = find_origin(rotor_poles * angle_rad, flux_Wb[:, 1:])
-    if abs(origin.aligned_rad) > max(ORIGIN_TOLERANCE_RAD, 1.5 * origin.error_rad):
+    if abs(origin.aligned_rad) > max(ORIGIN_TOLERANCE_RAD, ORIGIN_ERRORS * origin.error_rad):
         aligned_deg, error_deg = (math.degrees(of) / rotor_poles for of in (origin.aligned_rad, origin.error_rad))
         raise FluxMapError(
             f"line {curves[0].lines[0]}: the map is symmetric about {aligned_deg:.3f} +- {error_deg:.3f} deg, not"
@@ -260,7 +261,7 @@ def _check_fall_in(order: Sequence[int], curves: Sequence[Curve], flux_Wb: np.nd
                 f"line {_nearest_line(curves[at], current_A[column])}: at {current_A[column]:.3g} A the flux linkage is"
                 f" {flux_Wb[at, column]:.4g} Wb at {_degrees(curves[at].angle_rad)} deg and only"
                 f" {least_Wb[column]:.4g} Wb at {_degrees(nearer.angle_rad)} deg; from aligned (0 deg) to unaligned it"
-                f" must fall, but for {FALL_TOLERANCE:.0%} of the aligned"
+                f" must fall, but for {FALL_TOLERANCE:.0%} of the aligned: {IMPORT_HINT}"
             )
         lower = flux_Wb[at] < least_Wb
         least_Wb[lower], least_at[lower] = flux_Wb[at, lower], at

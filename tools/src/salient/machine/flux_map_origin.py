@@ -2,7 +2,8 @@
 
 Flux linkage is even about the aligned and about the unaligned position: at each current it is a sum of cosines of
 multiples of the electrical angle from there. The position is that of the least squares of such sums. A table of a whole
-pitch shows it by the difference of its halves, one of half a pitch by the slopes at its ends, which must be zero.
+pitch shows it by the difference of its halves, one of half a pitch by the slope at its aligned end, which must be
+zero. The unaligned end does not count: poles begin to overlap near it, and the corner there looks like a shift.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ HARMONICS_MAX = 12
 WHOLE_RAD = 1.5 * math.pi
 """Tables over less than that have hardly a point whose mirror image is there, too."""
 _CANDIDATES = 180  # over half a pitch
-_PARTS = (0.1, 0.15, 0.2, 0.27)  # of half a pitch, at each of its ends
-_SIGHT_RAD = math.pi / 6.0  # in which the position is sought at an end
+_PARTS = (0.1, 0.15, 0.2, 0.27)  # of half a pitch, at its aligned end
+_SIGHT_RAD = math.pi / 6.0  # in which the position is sought there
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def find_origin(angle_rad: np.ndarray, flux: np.ndarray) -> Origin:
     scaled = flux / np.maximum(np.max(np.abs(flux), axis=0), 1e-300)
     if angle_rad[-1] - angle_rad[0] >= WHOLE_RAD:
         return _by_halves(angle_rad, scaled)
-    return _by_ends(angle_rad, scaled)
+    return _by_end(angle_rad, scaled)
 
 
 def _by_halves(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
@@ -52,24 +53,20 @@ def _by_halves(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
     return Origin(math.remainder(aligned_rad, 2.0 * math.pi), 2.0 * deviation_rad + abs(fewer_rad - least_rad))
 
 
-def _by_ends(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
-    """From even parabolas through the points near the aligned and near the unaligned position, half a pitch apart:
-    the mean of several widths and degrees, by their variances, and their scatter."""
-    total = np.sum(scaled, axis=1)
-    aligned_rad = float(angle_rad[np.argmax(total)])
-    way = 1.0 if float(angle_rad[np.argmin(total)]) > aligned_rad else -1.0
-    ends_rad = (aligned_rad, float(angle_rad[np.argmin(total)]))
+def _by_end(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
+    """From even parabolas through the points near the aligned position: the mean of several widths and degrees, by
+    their variances, and their scatter."""
+    aligned_rad = float(angle_rad[np.argmax(np.sum(scaled, axis=1))])
     found = []
     for part in _PARTS:
-        chosen = [np.abs(angle_rad - end) <= part * math.pi for end in ends_rad]
+        chosen = np.abs(angle_rad - aligned_rad) <= part * math.pi
         for powers in (2, 3):
-            freedom = sum(int(np.sum(of)) for of in chosen) - 2 * powers - 1
-            if freedom < 1 or min(np.sum(of) for of in chosen) <= powers:
+            freedom = int(np.sum(chosen)) - powers - 1
+            if freedom < 1:
                 continue
 
-            def squares(at: float, chosen: list[np.ndarray] = chosen, powers: int = powers) -> float:
-                return sum(_even_squares(angle_rad[of] - at - end * way * math.pi, scaled[of], powers)
-                           for end, of in enumerate(chosen))
+            def squares(at: float, chosen: np.ndarray = chosen, powers: int = powers) -> float:
+                return _even_squares(angle_rad[chosen] - at, scaled[chosen], powers)
 
             candidates = aligned_rad + np.linspace(-_SIGHT_RAD, _SIGHT_RAD, 31)
             near_rad = float(candidates[np.argmin([squares(at) for at in candidates])])
