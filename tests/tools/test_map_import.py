@@ -19,7 +19,8 @@ from salient.machine.map_import.command import map_text
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
 from salient.machine.map_import.mat import mat_points
-from salient.machine.map_import.text import blocks
+from salient.machine.map_import.text import blocks, decode
+from salient.machine.report import describe
 from salient.paths import MACHINES
 
 TRUTH = load_machine(MACHINES / "finite_element.toml").magnetics
@@ -80,6 +81,17 @@ LAYOUTS = {
     "matrix, currents across": matrix(VALUES, ""),
     "field solver's columns": MAXWELL,
     "field solver's console": FEMM,
+    "currents down the rows": "current_A," + ",".join(f"{angle:g}" for angle in ANGLES_DEG) + "\n" + "\n".join(
+        ",".join(f"{value:.9g}" for value in (current, *fluxes))
+        for current, fluxes in zip(CURRENTS_A, VALUES.T, strict=True)),
+    "numbers alone, currents across": matrix(VALUES, "0"),
+    "field solver's long table with time": "\"Time [s]\",\"Angle [deg]\",\"Current [A]\",\"FluxLinkage [Wb]\"\n"
+        + "\n".join(f"{1e-3 * angle:.9g},{angle:g},{current:g},{psi:.9g}"
+                    for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+                    for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+    "mA and mWb without units": "angle,current,flux\n" + "\n".join(
+        f"{angle:g},{1e3 * current:g},{1e3 * psi:.9g}" for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+        for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
     "electrical radians": "theta_elec_rad,current_A,flux_Wb\n" + "\n".join(
         f"{math.radians(POLES * angle):.9g},{current:g},{psi:.9g}"
         for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
@@ -147,3 +159,49 @@ def test_coarse_half_pitch_of_narrow_poles_keeps_its_origin_within_its_own_error
         values = rows[:, 2].reshape(97, -1)[::every]
         origin = find_origin(np.linspace(0.0, math.pi, len(values)), values)
         assert abs(origin.aligned_rad) <= max(ORIGIN_TOLERANCE_RAD, ORIGIN_ERRORS * origin.error_rad), number
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252"])
+def test_text_of_a_spreadsheet_is_decoded(encoding):
+    text = long_table(VALUES, "Winkel [\u00b0];Strom [A];Fluss [Wb]", ";")
+    assert decode(text.encode(encoding)) == text
+    assert origin_of(imported(decode(text.encode(encoding))))[0] == pytest.approx(0.5, abs=0.05)
+
+
+def test_one_command_imports_and_the_next_describes_the_written_machine(salient_without_build, tmp_path):
+    (tmp_path / "table.csv").write_text(long_table(VALUES), encoding="utf-8")
+    done = salient_without_build("machine", MACHINES / "finite_element.toml", "--import", tmp_path / "table.csv",
+                                 "--out", tmp_path / "new")
+    assert done.returncode == 0, done.stderr
+    assert "origin: aligned at 0.500" in done.stdout and "asymmetry: " in done.stdout
+    written = tmp_path / "new" / "finite_element.toml"
+    assert str(written) in done.stdout
+    again = salient_without_build("machine", written, "--out", tmp_path / "view")
+    assert again.returncode == 0, again.stderr
+    assert "8/6 poles, 4 phases, magnetics map" in again.stdout and "imported" not in again.stdout
+    angles_rad, currents_A = np.radians(np.arange(31.0))[:, None], CURRENTS_A
+    given = TRUTH.flux_linkage_Wb(angles_rad, currents_A)
+    assert np.max(np.abs(load_machine(written).magnetics.flux_linkage_Wb(angles_rad, currents_A) - given)) < (
+        5e-3 * np.max(given))
+
+
+def test_saturation_of_a_machine_is_stated():
+    """2 mH of 23.6 mH at the least; a linear machine has none."""
+    assert "; no saturation" in "\n".join(describe(load_machine(MACHINES / "linear_cosine.toml")))
+    machine = load_machine(MACHINES / "saturating.toml")
+    found = re.search(r"saturation leaves (\d+) % aligned at (\S+) A", "\n".join(describe(machine)))
+    at_A = float(found[2])
+    left = float(machine.magnetics.flux_linkage_Wb(0.0, at_A)) / at_A / 23.6e-3
+    assert float(found[1]) == pytest.approx(100.0 * left, abs=0.6) and left < 0.9
+
+
+def test_halves_that_differ_are_named_by_angles_of_the_file():
+    angles_deg = np.linspace(0.0, 60.0, 38)
+    factor = np.where(angles_deg > 30.0, 1.05, 1.0)[:, None]
+    rows = [f"{angle:.9g},{current:g},{psi:.9g}"
+            for angle, fluxes in zip(angles_deg, factor * flux(angles_deg), strict=True)
+            for current, psi in zip(CURRENTS_A, fluxes, strict=True)]
+    with pytest.raises(FluxMapError, match="--import") as refusal:
+        map_of_text("\n".join(["angle_deg,current_A,flux_linkage_Wb", *rows]), POLES)
+    named = [float(angle) for angle in re.findall(r"line \d+ \((\S+) deg\)", str(refusal.value))]
+    assert len(named) == 2 and all(np.min(np.abs(angles_deg - angle)) < 1e-3 for angle in named)
