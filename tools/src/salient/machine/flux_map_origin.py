@@ -19,6 +19,7 @@ HARMONICS_MAX = 12
 WHOLE_RAD = 1.5 * math.pi
 """Tables over less than that have hardly a point whose mirror image is there, too."""
 _CANDIDATES = 180  # over half a pitch
+_UNEVEN_CANDIDATES = 15  # to either side of the position of the even sums
 _PARTS = (0.1, 0.15, 0.2, 0.27)  # of half a pitch, at its aligned end
 _SIGHT_RAD = math.pi / 6.0  # in which the position is sought there
 
@@ -45,12 +46,18 @@ def _by_halves(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
     step_rad = math.pi / _CANDIDATES
     candidates = step_rad * np.arange(_CANDIDATES)
     near_rad = float(candidates[np.argmin([_squares(at, angle_rad, scaled, harmonics) for at in candidates])])
-    least_rad, least, curvature = _least(near_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, harmonics))
+    shifted_rad, *_ = _least(near_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, harmonics))
+    # Halves that differ look like a shift to the even sums alone.
+    candidates = shifted_rad + step_rad * np.arange(-_UNEVEN_CANDIDATES, _UNEVEN_CANDIDATES + 1)
+    squares = [_squares(at, angle_rad, scaled, harmonics, uneven=True) for at in candidates]
+    least_rad, least, curvature = _least(float(candidates[np.argmin(squares)]), step_rad,
+                                         lambda at: _squares(at, angle_rad, scaled, harmonics, uneven=True))
     fewer = max(2, harmonics // 2 + 1)
-    fewer_rad, *_ = _least(least_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, fewer))
+    fewer_rad, *_ = _least(least_rad, step_rad, lambda at: _squares(at, angle_rad, scaled, fewer, uneven=True))
     deviation_rad = _deviation_rad(least, curvature, len(angle_rad) - harmonics - 2)
     aligned_rad = _aligned(least_rad, angle_rad, scaled, harmonics)
-    return Origin(math.remainder(aligned_rad, 2.0 * math.pi), 2.0 * deviation_rad + abs(fewer_rad - least_rad))
+    error_rad = 2.0 * deviation_rad + abs(fewer_rad - least_rad) + 0.5 * abs(shifted_rad - least_rad)
+    return Origin(math.remainder(aligned_rad, 2.0 * math.pi), error_rad)
 
 
 def _by_end(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
@@ -99,12 +106,20 @@ def _basis(at_rad: float, angle_rad: np.ndarray, harmonics: int) -> np.ndarray:
     return basis
 
 
-def _squares(at_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
-    """Sum of squares that even sums about a position leave."""
+def _squares(at_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int, *, uneven: bool = False
+             ) -> float:
+    """Sum of squares that even sums about a position leave; uneven: times 1 + a sin, whose one half is higher."""
     basis = _basis(at_rad, angle_rad, harmonics)
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     known = left[:, values > 1e-3 * values[0]]  # what the angles determine
-    return float(np.sum((scaled - known @ (known.T @ scaled)) ** 2))
+    even = known @ (known.T @ scaled)
+    rest = scaled - even
+    squares = float(np.sum(rest**2))
+    if not uneven:
+        return squares
+    higher = np.sin(angle_rad - at_rad)[:, None] * even
+    higher -= known @ (known.T @ higher)
+    return squares - float(np.sum(rest * higher)) ** 2 / max(float(np.sum(higher**2)), 1e-300)
 
 
 def _least(near_rad: float, step_rad: float, squares: Callable[[float], float]) -> tuple[float, float, float]:
