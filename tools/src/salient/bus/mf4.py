@@ -47,7 +47,7 @@ class Mf4Log(FileLog):
             import asammdf
         except ImportError:
             raise UsageError(f"--out {path}: MF4 requires the Python package asammdf "
-                             "(pip install 'salient-drive[mf4]')") from None
+                             "(pip install asammdf)") from None
         self._mdf: Any = asammdf.MDF(version="4.10")
         self._signal = asammdf.Signal
         self._carrier, self._node = carrier, node

@@ -44,7 +44,7 @@ def read_mf4(file: LogInput, path: Path) -> Iterator[tuple[int, can.Message]]:
         import asammdf
     except ImportError:
         raise UsageError(f"{path}: MF4 requires the Python package asammdf "
-                         "(pip install 'salient-drive[mf4]')") from None
+                         "(pip install asammdf)") from None
     with tempfile.TemporaryFile() if file.is_compressed else path.open("rb") as stream:
         if file.is_compressed:
             while data := file.read(1 << 20):

@@ -141,7 +141,7 @@ class ParquetLog(TableLog):
             import pyarrow.parquet
         except ImportError:
             raise UsageError(f"--out {path}: Parquet requires the Python package pyarrow "
-                             "(pip install 'salient-drive[parquet]')") from None
+                             "(pip install pyarrow)") from None
         self._arrow: Any = pyarrow
         types = (pyarrow.int64(), pyarrow.string(), pyarrow.string(), pyarrow.float64(), pyarrow.string(),
                  pyarrow.string())
