@@ -77,7 +77,10 @@ def begin() -> bool:
             return False
         folder = None
         try:
-            folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-")).absolute()
+            # Beside those of the runs around it: a path within all of them is too long for sockets.
+            outermost = os.environ.get(RUNS, "").partition(os.pathsep)[0]
+            beside = str(Path(outermost).parent) if outermost else None
+            folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-", dir=beside)).absolute()
             _start(pidfd, folder)
         except (OSError, NotImplementedError):
             if folder:
@@ -114,7 +117,7 @@ def _end() -> None:
     os.environ[RUNS] = runs
     if not runs:
         del os.environ[RUNS]
-    os.environ["TMPDIR"] = tempfile.tempdir = str(folder.parent)
+    os.environ["TMPDIR"] = tempfile.tempdir = str(_folder() or folder.parent)
     if not (folder / _LIST).exists():
         _remove(folder)
 
