@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -17,7 +16,7 @@ from salient.__main__ import main
 from salient.builder import build_preset
 from salient.config import TARGET_BUILDS, WASM_BUILD
 from salient.errors import UsageError
-from salient.guard import guarded
+from salient.guard import guarded, outside
 from salient.paths import BUILD, ROOT, build_lock, from_root
 from salient.turns import TURNS, turn_of_name
 
@@ -68,7 +67,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     config = session.config
     # Processes and temporary files of a test end with pytest, whatever ends it. The folders of tmp_path stay where
     # pytest has them, and as long.
-    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(outside()))
     run = ExitStack()
     run.enter_context(guarded())
     config.add_cleanup(run.close)

@@ -69,7 +69,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
         (["sweep", "start_6000"], ["scenario 'start_6000': no such file, and no bundled scenario of that name; ",
                                    "must be one of load_step_150, start_600"]),
         (["log", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
-        (["log", "--out", "can.csv"], ["can.csv", ".blf or .log"]),
+        (["log", "--out", "can.xyz"], ["can.xyz", ".blf"]),
         (["monitor", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
         (["test", "--only", "everything"], ["everything", "unit"]),
         (["bench"], ["bench", "benchmark"]),

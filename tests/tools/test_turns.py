@@ -29,6 +29,7 @@ def test_short():
 def collected(file: Path, *options: str) -> list[str]:
     """Names of the tests that are run of a file, with the hooks of tests/conftest.py."""
     done = subprocess.run([sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider",
+                           f"--rootdir={file.parent}",
                            *options, str(file)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return [line.rpartition("::")[2] for line in done.stdout.splitlines() if "::" in line]
@@ -56,6 +57,7 @@ def test_a_marked_file_is_run_as_a_whole_in_its_turn(folder):
     turn = turn_of_name("test_some.py")
     assert len(collected(file, f"--turn={turn}")) == 25
     done = subprocess.run([sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider",
+                           f"--rootdir={file.parent}",
                            f"--turn={(turn + 1) % TURNS}", str(file)], capture_output=True, text=True, check=False)
     assert "no tests collected (25 deselected)" in done.stdout, done.stdout + done.stderr
 

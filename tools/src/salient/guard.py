@@ -58,6 +58,12 @@ def removes(path: Path) -> None:
             file.write(os.fsencode(path.absolute()) + b"\0")
 
 
+def outside() -> Path:
+    """Folder of temporary files that no run removes."""
+    outermost = os.environ.get(RUNS, "").partition(os.pathsep)[0]
+    return Path(outermost).parent if outermost else Path(tempfile.gettempdir())
+
+
 def _folder() -> Path | None:
     """The folder of the innermost run."""
     runs = os.environ.get(RUNS)
@@ -78,9 +84,7 @@ def begin() -> bool:
         folder = None
         try:
             # Beside those of the runs around it: a path within all of them is too long for sockets.
-            outermost = os.environ.get(RUNS, "").partition(os.pathsep)[0]
-            beside = str(Path(outermost).parent) if outermost else None
-            folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-", dir=beside)).absolute()
+            folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-", dir=outside())).absolute()
             _start(pidfd, folder)
         except (OSError, NotImplementedError):
             if folder:

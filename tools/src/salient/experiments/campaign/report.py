@@ -94,7 +94,7 @@ def _planted() -> tuple[str, str, str]:
     of = note["campaign"]
     least_s, middle_s, most_s = of["processor_s"]
     return ("planted bugs",
-            f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} processor "
+            f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} CPU-"
             f"seconds each, {middle_s:.1f} in the middle, by seeds from 1 to at most {of['last_seed']}; shrunk to at "
             f"most {of['events']} events in at most {of['shrinking_s']:.1f} CPU-seconds; {of['replayed']} "
             "replayed with equal bits, log and plots; the counts are in [planted.json](../tests/planted.json)",
