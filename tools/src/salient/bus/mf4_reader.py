@@ -43,8 +43,7 @@ def read_mf4(file: LogInput, path: Path) -> Iterator[tuple[int, can.Message]]:
     try:
         import asammdf
     except ImportError:
-        raise UsageError(f"{path}: MF4 requires the Python package asammdf "
-                         "(pip install asammdf)") from None
+        raise UsageError(f"{path}: MF4 requires the Python package asammdf (pip install asammdf)") from None
     with tempfile.TemporaryFile() if file.is_compressed else path.open("rb") as stream:
         if file.is_compressed:
             while data := file.read(1 << 20):
@@ -75,7 +74,7 @@ class _Blocks:
 
     def read(self, address: int) -> tuple[bytes, list[int], int]:
         """Kind, links and length. Damage: it is no block that the file has."""
-        self._stream.seek(address)
+        self._stream.seek(min(address, self._size))  # a link of 64 bits may lead beyond what a file can have
         header = self._stream.read(_BLOCK.size)
         if len(header) < _BLOCK.size:
             raise Damage(f"truncated: byte {address}: a block begins there, the file has {self._size} bytes")
