@@ -76,8 +76,8 @@ def test_suite_on_the_bus_of_a_drive_alone_skips_what_needs_the_bench(request, t
     interface = request.config.getoption("--salient-can")
     address = f"unix:{tmp_path}/bus" if interface == "local" else interface
     (tmp_path / "test_some.py").write_text(SUITE)
-    # A tenth of real time: the time-out of commands leaves a wide margin for a slow computer.
-    with EmulatorProcess(BenchConfig(pace="x0.1", drive_only=True), address):
+    # A hundredth of real time: the time-out of commands, 50 ms of the drive, is 5 s of a slow computer.
+    with EmulatorProcess(BenchConfig(pace="x0.01", drive_only=True), address):
         done = subprocess.run([sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider",
                                f"--salient-can={address}", "."], cwd=tmp_path, capture_output=True, text=True)
     assert "1 passed, 1 skipped" in done.stdout, done.stdout + done.stderr
