@@ -18,7 +18,6 @@ from salient.errors import UsageError
 from salient.machine.drive_report import drive_json, drive_lines, pulse_lines
 from salient.machine.file import Converter, Machine, MachineError, Sensors, load_machine, machine_path
 from salient.machine.firmware_tables import machine_phase_map
-from salient.machine.map_import.command import import_map
 from salient.machine.scaling import scaling_of
 
 # Currents in the machine's unit (scaling.py): up to the end of the firmware's tables.
@@ -38,6 +37,8 @@ def run(name_or_path: str, out: Path, json_path: Path | None = None, dbc_path: P
     try:
         path = machine_path(name_or_path)
         if table is not None:
+            from salient.machine.map_import.command import import_map  # SciPy's splines: most of a second
+
             path, corrections = import_map(path, table, out)
             print("\n".join([f"imported: {table}", *(f"  {line}" for line in corrections),
                              f"machine file: {path}, with its map beside it"]))
