@@ -33,18 +33,24 @@ class TextFileError(Exception):
 def read_text(path: Path, bytes_max: int) -> str:
     """The whole file, UTF-8 with or without a byte order mark."""
     try:
+        return read_bytes(path, bytes_max).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TextFileError(f"not UTF-8 at byte {error.start + 1}") from None
+
+
+def read_bytes(path: Path, bytes_max: int) -> bytes:
+    """The whole file."""
+    try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise TextFileError("not a file")  # a pipe may block, a device may have no end
         if status.st_size > bytes_max:
             raise TextFileError(f"larger than {bytes_max // 1_000_000} MB")
-        return path.read_bytes().decode("utf-8-sig")
+        return path.read_bytes()
     except FileNotFoundError:
         raise TextFileError("no such file") from None
     except OSError as error:
         raise TextFileError(f"cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise TextFileError(f"not UTF-8 at byte {error.start + 1}") from None
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -10,12 +10,12 @@ from typing import Any
 from salient.errors import UsageError
 from salient.machine.file import Poles, poles_and_phases
 from salient.machine.flux_map import FluxMapError
-from salient.machine.flux_map_csv import map_of_text
+from salient.machine.flux_map_csv import FILE_BYTES_MAX, map_of_text
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
 from salient.machine.map_import.mat import is_mat, mat_points
-from salient.machine.map_import.text import blocks, decode, read_bytes
-from salient.toml_file import TextFileError, read_text, read_toml, validate
+from salient.machine.map_import.text import blocks, decode
+from salient.toml_file import TextFileError, read_bytes, read_text, read_toml, validate
 
 
 def import_map(machine: Path, table: Path, out: Path) -> tuple[Path, list[str]]:
@@ -54,7 +54,10 @@ def import_map(machine: Path, table: Path, out: Path) -> tuple[Path, list[str]]:
 
 def read_points(table: Path) -> Points:
     """The points of a CSV, text or MAT file. FluxMapError."""
-    data = read_bytes(table)
+    try:
+        data = read_bytes(table, FILE_BYTES_MAX)
+    except TextFileError as error:
+        raise FluxMapError(str(error)) from None
     return mat_points(data) if is_mat(data) else points_of(blocks(decode(data)))
 
 

@@ -7,11 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from salient.machine.flux_map import FluxMapError
-
-BYTES_MAX = 20_000_000
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MISSING = {"", "nan", "-", "--", "n/a", "na", "null"}
 _SEPARATORS = (";", "\t", ",", None)
@@ -33,18 +29,6 @@ class Block:
     titles: list[str] = field(default_factory=list)
     header: tuple[str, ...] = ()
     rows: list[Row] = field(default_factory=list)
-
-
-def read_bytes(path: Path) -> bytes:
-    """The whole file, of at most BYTES_MAX."""
-    try:
-        if not path.is_file():
-            raise FluxMapError("not a file" if path.exists() else "no such file")
-        if path.stat().st_size > BYTES_MAX:
-            raise FluxMapError(f"larger than {BYTES_MAX // 1_000_000} MB")
-        return path.read_bytes()
-    except OSError as error:
-        raise FluxMapError(f"cannot be read: {error.strerror}") from None
 
 
 def decode(data: bytes) -> str:
