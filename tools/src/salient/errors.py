@@ -3,11 +3,13 @@
 import contextlib
 import difflib
 import errno
+import importlib
 import os
 import select
 import signal
 import sys
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from salient.guard import guarded
 
@@ -55,6 +57,15 @@ class RunFailed(Exception):
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Errors of a write, which names no file."""
+
+
+def optional_package(name: str, needed_by: str) -> Any:
+    """A module of a package that only some commands need. UsageError, a line that needed_by begins: it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition(".")[0]
+        raise UsageError(f"{needed_by} requires the Python package {package} (pip install {package})") from None
 
 
 def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: None) -> int:

@@ -23,7 +23,7 @@ import numpy as np
 from can.util import dlc2len
 
 from salient.bus.log_input import Damage, LogInput
-from salient.errors import UsageError
+from salient.errors import optional_package
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _BLOCK = struct.Struct("<4s4xQQ")
@@ -40,10 +40,7 @@ _CHAINED = {b"##HD": (0,), b"##DG": (0, 1), b"##CG": (0, 1), b"##CN": (0, 1), b"
 
 def read_mf4(file: LogInput, path: Path) -> Iterator[tuple[int, can.Message]]:
     """Time in ns, since 1970, and frame, in the order of time. Damage."""
-    try:
-        import asammdf
-    except ImportError:
-        raise UsageError(f"{path}: MF4 requires the Python package asammdf (pip install asammdf)") from None
+    asammdf = optional_package("asammdf", f"{path}: MF4")
     with tempfile.TemporaryFile() if file.is_compressed else path.open("rb") as stream:
         if file.is_compressed:
             while data := file.read(1 << 20):

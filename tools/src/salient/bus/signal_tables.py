@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 
 import can
 
-from salient.bus.file_log import FileLog
-from salient.bus.identity import Carrier, OtherDatabase
-from salient.bus.signals import Signal, SignalTable, drive_database, rig_database
-from salient.errors import UsageError
+from salient.bus.decoded_log import FRAME_BYTES, DecodedLog
+from salient.bus.identity import Carrier
+from salient.bus.signals import Signal, drive_database
+from salient.errors import optional_package
 
 _BATCH_FRAMES = 20_000
 _HELD_MAX = 1_000_000
@@ -25,36 +24,19 @@ Row = tuple[int, str, str, float, str, str]
 """Time in ns, message, signal, value, unit, and the name of the value where it has one."""
 
 
-class TableLog(FileLog):
-    """A table of signals, in the order of time within each 20,000 frames. The frames that the DBCs of drive and test
-    bench do not define are left out, as in MF4. write raises OtherDatabase, as Carrier does."""
+class TableLog(DecodedLog):
+    """A table of signals, in the order of time within each 20,000 frames."""
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
-        super().__init__(path)
-        self._carrier, self._node, self._source = carrier, node, source
-        self._tables = self._new_tables()
-        self._finished = 0
-        self._closed = False
-
-    def _new_tables(self) -> tuple[SignalTable, SignalTable]:
-        return SignalTable(drive_database(None, self._node)), SignalTable(rig_database(self._node))
+    _finished = 0
 
     def write(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame."""
-        try:
-            known = self._carrier.take(message)
-        except OtherDatabase:
-            if self._carrier.machine is None:
-                self.discard()
-            raise
-        for table in self._tables:
-            table.add(time_ns, message)
-        if (waiting := sum(map(SignalTable.frames, self._tables))) >= (_BATCH_FRAMES if known else _HELD_MAX):
-            self._put()
+        known = self._take(time_ns, message)
+        if (waiting := self._waiting) >= (_BATCH_FRAMES if known else _HELD_MAX):
+            self._write_kept()
             self._finished += waiting
 
-    def _put(self) -> None:
-        """Writes the rows of the frames that wait."""
+    def _write_kept(self) -> None:
         self._tables[0].decode_with(drive_database(self._carrier.likely, self._node))
         self.put_rows(sorted(self._rows(), key=lambda row: row[0]))
         self._tables = self._new_tables()
@@ -73,23 +55,9 @@ class TableLog(FileLog):
         """Appends rows."""
         raise NotImplementedError
 
-    def finish(self) -> None:
-        """Completes the file."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        if self._closed:
-            return
-        self._closed = True
-        if self._carrier.machine is None and len(self._tables[0]["DRIVE_STATUS.state"]):
-            print(f"salient: {self._source}: no DRIVE_IDENTITY: {self.path} has the signals of {self._carrier.likely}; "
-                  "--machine states another", file=sys.stderr)
-        self._put()
-        self.finish()
-
     @property
     def size(self) -> int:
-        return 16 * (self._finished + sum(map(SignalTable.frames, self._tables)))
+        return FRAME_BYTES * (self._finished + self._waiting)
 
 
 def _names(signal: Signal) -> list[str]:
@@ -122,7 +90,7 @@ class CsvLog(TableLog):
     def size(self) -> int:
         return self._bytes
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         self._file.close()
 
 
@@ -136,23 +104,19 @@ class ParquetLog(TableLog):
 
     def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
         super().__init__(path, carrier, node, source)
-        try:
-            import pyarrow
-            import pyarrow.parquet
-        except ImportError:
-            raise UsageError(f"--out {path}: Parquet requires the Python package pyarrow "
-                             "(pip install pyarrow)") from None
-        self._arrow: Any = pyarrow
+        pyarrow: Any = optional_package("pyarrow", f"--out {path}: Parquet")
+        parquet: Any = optional_package("pyarrow.parquet", f"--out {path}: Parquet")
+        self._arrow = pyarrow
         types = (pyarrow.int64(), pyarrow.string(), pyarrow.string(), pyarrow.float64(), pyarrow.string(),
                  pyarrow.string())
         names = ("time_ns", *_COLUMNS[1:])
         self._schema: Any = pyarrow.schema(list(zip(names, types, strict=True)))
-        self._writer: Any = pyarrow.parquet.ParquetWriter(path, self._schema)
+        self._writer = parquet.ParquetWriter(path, self._schema)
 
     def put_rows(self, rows: list[Row]) -> None:
         if rows:
             columns = [list(column) for column in zip(*rows, strict=True)]
             self._writer.write_table(self._arrow.table(columns, schema=self._schema))
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         self._writer.close()

@@ -1,0 +1,75 @@
+"""What logs of decoded signals have in common: the frames that wait, and the machine that decodes them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import can
+from cantools.database.can import Database
+
+from salient.bus.file_log import FileLog
+from salient.bus.identity import Carrier, OtherDatabase
+from salient.bus.signals import SignalTable, drive_database, rig_database
+
+FRAME_BYTES = 16
+"""Memory of a frame that waits."""
+
+
+class DecodedLog(FileLog):
+    """Frames that the DBCs of drive and test bench do not define are left out: other identifiers and lengths, remote,
+    error and flexible data rate frames.
+
+    write raises OtherDatabase, as Carrier does: with the first report of another machine than the one that is stated,
+    or of an unknown one, and then there is no file; or when the drive becomes another one, and the file ends there.
+    """
+
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+        super().__init__(path)
+        self._carrier, self._node, self._source = carrier, node, source
+        self._tables = self._new_tables()
+        self._refused = self._closed = False
+
+    def _databases(self, machine: str | None) -> tuple[Database, Database]:
+        return drive_database(machine, self._node), rig_database(self._node)
+
+    def _new_tables(self) -> tuple[SignalTable, SignalTable]:
+        drive, rig = self._databases(None)
+        return SignalTable(drive), SignalTable(rig)
+
+    def _take(self, time_ns: int, message: can.Message) -> bool:
+        """Keeps a frame; True once the machine is known. OtherDatabase."""
+        try:
+            known = self._carrier.take(message)
+        except OtherDatabase:
+            if self._carrier.machine is None:
+                self.path.unlink(missing_ok=True)
+                self._refused = True
+            raise
+        for table in self._tables:
+            table.add(time_ns, message)
+        return known
+
+    @property
+    def _waiting(self) -> int:
+        """Frames that are kept."""
+        return sum(map(SignalTable.frames, self._tables))
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        if not self._refused:
+            if self._carrier.machine is None and len(self._tables[0]["DRIVE_STATUS.state"]):
+                print(f"salient: {self._source}: no DRIVE_IDENTITY: {self.path} has the signals of "
+                      f"{self._carrier.likely}; --machine states another", file=sys.stderr)
+            self._write_kept()
+        self._finish()
+
+    def _write_kept(self) -> None:
+        """Writes the frames that are kept, as those of the likely machine."""
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        """Closes the file."""
+        raise NotImplementedError
