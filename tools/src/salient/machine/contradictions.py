@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from salient.machine.drive_data import SAMPLES_PER_TURN_MIN
+from salient.machine.drive_data import SAMPLES_PER_TURN_MIN, sampled_speed_rpm
 from salient.machine.facts import MAP_FILE, Facts, unit_of
 from salient.machine.fold_back import field_J
 from salient.machine.magnetics import Formula
 from salient.machine.torque_speed import mean_torque_Nm, smooth_torque_Nm, torque_bound_Nm
 
 FALL_MAX = 0.01
-"""As FALL_TOLERANCE of firmware_tables.py."""
+"""By which the torque may fall as the current rises, of the largest torque; tables with more are refused."""
 INDUCTANCE_RATIO_MAX = 150.0
 """Aligned to unaligned. Leakage keeps built machines between 3 and 40; a unit is wrong by 1000."""
 PEAK_CURRENT_A = (0.2, 5000.0)
@@ -320,7 +320,7 @@ _RULES_OF_TORQUE = (
 _RULES_OF_SPEED = (
     Rule("speed_base_rpm", _times(1.0, "speed_max_rpm"), "which is", "speed_max_rpm"),
     Rule("speed_max_rpm", _times(1.0, "over_speed_rpm"), "which trips before:", "over_speed_rpm"),
-    Rule("speed_max_rpm", lambda of: 60.0 * of["control_rate_hz"] / (SAMPLES_PER_TURN_MIN * of.machine.rotor_poles),
+    Rule("speed_max_rpm", lambda of: sampled_speed_rpm(of["control_rate_hz"], of.machine),
          f"for {SAMPLES_PER_TURN_MIN} control periods in an electrical revolution at", "control_rate_hz"),
     Rule("speed_base_rpm", lambda of: BASE_SPEED_MIN_RPM, "as no drive is slower, but so slowly the flux linkage is"
          " built up by", "supply_min_V", least=True),

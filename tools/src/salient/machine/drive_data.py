@@ -133,6 +133,11 @@ class _Values:
         return value
 
 
+def sampled_speed_rpm(control_rate_hz: float, machine: Machine) -> float:
+    """The speed with SAMPLES_PER_TURN_MIN control periods in an electrical revolution."""
+    return 60.0 * control_rate_hz / (SAMPLES_PER_TURN_MIN * machine.rotor_poles)
+
+
 def _derive_ratings(machine: Machine, data: _Values) -> None:
     magnetics, phases, supply_V = machine.magnetics, machine.phases, machine.supply_voltage_V
     minimum_V = data.add("supply_min_V", "V", min(supply_V, data.given.get("supply_max_V", supply_V)),
@@ -158,7 +163,7 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
                        current_of_torque_A(magnetics, phases, rated_Nm / SMOOTH_SHARE, peak_A),
                        "current whose smooth torque, as for torque_peak_Nm, is torque_rated_Nm")
 
-    sampled_rpm = 60.0 * rate_hz / (SAMPLES_PER_TURN_MIN * machine.rotor_poles)
+    sampled_rpm = sampled_speed_rpm(rate_hz, machine)
     data.add("speed_base_rpm", "r/min",
              min(_base_speed_rpm(machine, minimum_V, rated_A), sampled_rpm,
                  data.given.get("speed_max_rpm", math.inf)),

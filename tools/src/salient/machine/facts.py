@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cached_property
 
 from salient.machine.definition import Machine
-from salient.machine.drive_data import SAMPLES_PER_TURN_MIN, DriveData, derive
+from salient.machine.drive_data import DriveData, derive, sampled_speed_rpm
 from salient.machine.flux_map import FluxMap
 from salient.machine.parameter_table import read_table
 
@@ -107,8 +107,7 @@ def _base_speed(of: Facts) -> str:
 
 def _sampled(of: Facts, name: str) -> bool:
     """Whether the control rate limits a speed."""
-    limit_rpm = 60.0 * of["control_rate_hz"] / (SAMPLES_PER_TURN_MIN * of.machine.rotor_poles)
-    return of[name] >= limit_rpm * (1.0 - 1e-9)
+    return of[name] >= sampled_speed_rpm(of["control_rate_hz"], of.machine) * (1.0 - 1e-9)
 
 
 def _peak_current(of: Facts) -> str:

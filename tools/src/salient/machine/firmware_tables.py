@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from salient.machine.contradictions import FALL_MAX
 from salient.machine.drive_data import derive
 from salient.machine.file import Machine, MachineError
 from salient.machine.scaling import Exponents
@@ -45,9 +46,8 @@ _TOLERANCE_STEP = 2.0
 _ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # fractions of the largest
 
 # Torque that falls with the current, or is negative from the unaligned to the aligned position, has no inverse and is
-# levelled: as noise of a map, up to this fraction of the largest torque at the same current; beyond the map's largest
+# levelled: as noise of a map, up to FALL_MAX of the largest torque at the same current; beyond the map's largest
 # current, where its flux linkage is extrapolated linearly, by any amount.
-FALL_TOLERANCE = 0.01
 
 # Torque, as a fraction of the largest at the same current, that is none: what a spline through a map leaves before the
 # poles overlap, of any slope. A phase that is to make a torque there would turn its current off.
@@ -199,14 +199,14 @@ def _rising_torque(magnetics: Any, angle_rad: np.ndarray) -> np.ndarray:
     torque_Nm = magnetics.torque_Nm(angle_rad, CURRENT_A)
     torque_Nm = np.where(CURRENT_A > 0.0, torque_Nm, 0.0)  # not what rounding leaves there
     rising_Nm = np.maximum.accumulate(np.maximum(torque_Nm, 0.0), axis=1)
-    excess_Nm = rising_Nm - torque_Nm - FALL_TOLERANCE * np.max(torque_Nm, axis=0)
+    excess_Nm = rising_Nm - torque_Nm - FALL_MAX * np.max(torque_Nm, axis=0)
     excess_Nm = np.where(magnetics.current_max_A >= CURRENT_A, excess_Nm, 0.0)
     row, column = np.unravel_index(np.argmax(excess_Nm), excess_Nm.shape)
     if excess_Nm[row, column] > 0.0:
         raise PhaseMapError(
             f"at {math.degrees(angle_rad[row, 0]):.4g} deg, towards aligned, the torque falls to"
             f" {torque_Nm[row, column] * magnetics.newton_metre:.4g} N m at {CURRENT_A[column] * magnetics.ampere:g} A;"
-            f" it must rise with the current, except for {FALL_TOLERANCE:.0%} of the largest torque at that current"
+            f" it must rise with the current, except for {FALL_MAX:.0%} of the largest torque at that current"
         )
     return np.where(rising_Nm > _NO_TORQUE * rising_Nm.max(axis=0), rising_Nm, 0.0)
 
