@@ -202,13 +202,8 @@ void configure_torque(control_parameters_t *control, const configure_source_t *f
     const int32_t *values = from->values;
     control->torque_law = from->controller.torque_law;
     control->interleaved_pwm = from->controller.may_interleave_pulses && values[PARAMETER_PULSES_PER_PERIOD] == 2;
-    control->commutation = commutation_configure(
-        &(commutation_angles_t){
-            .turn_on = commutation_angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
-            .turn_off = commutation_angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
-            .outgoing_off = commutation_angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
-        },
-        from->tables->phases, from->tables->rotor_poles);
+    const commutation_angles_t angles = parameters_commutation_angles(values);
+    control->commutation = commutation_configure(&angles, from->tables->phases, from->tables->rotor_poles);
     control->hysteresis = (ditc_hysteresis_parameters_t){
         .band_inner_q24 = values[PARAMETER_TORQUE_BAND_INNER_NM],
         .band_outer_q24 = values[PARAMETER_TORQUE_BAND_OUTER_NM],

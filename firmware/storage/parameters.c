@@ -3,7 +3,6 @@
 #include <assert.h>
 #include <string.h>
 
-#include "control/commutation.h"
 #include "control/machine_tables.h"
 #include "fixed/compiler.h"
 #include "fixed/crc32.h"
@@ -145,20 +144,24 @@ static parameters_verdict_t check_orders(const parameters_t *present, const int3
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }
 
-static uint32_t angle_of(const int32_t values[PARAMETER_COUNT], unsigned index) {
-    return commutation_angle_from_degrees(values[index]);
+COLD commutation_angles_t parameters_commutation_angles(const int32_t values[PARAMETER_COUNT]) {
+    return (commutation_angles_t){
+        .turn_on = commutation_angle_from_degrees(values[PARAMETER_TURN_ON_ANGLE_DEG]),
+        .turn_off = commutation_angle_from_degrees(values[PARAMETER_TURN_OFF_ANGLE_DEG]),
+        .outgoing_off = commutation_angle_from_degrees(values[PARAMETER_OUTGOING_OFF_ANGLE_DEG]),
+    };
+}
+
+static bool same(const parameters_t *present, const int32_t values[PARAMETER_COUNT], unsigned index) {
+    return values[index] == present->values[index];
 }
 
 /* Angles of turn-on and turn-off that are new. */
 static parameters_verdict_t check_direction(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {
-    const commutation_angles_t angles = {
-        .turn_on = angle_of(values, PARAMETER_TURN_ON_ANGLE_DEG),
-        .turn_off = angle_of(values, PARAMETER_TURN_OFF_ANGLE_DEG),
-        .outgoing_off = angle_of(values, PARAMETER_OUTGOING_OFF_ANGLE_DEG),
-    };
-    const bool kept = angles.turn_on == angle_of(present->values, PARAMETER_TURN_ON_ANGLE_DEG) &&
-                      angles.turn_off == angle_of(present->values, PARAMETER_TURN_OFF_ANGLE_DEG) &&
-                      angles.outgoing_off == angle_of(present->values, PARAMETER_OUTGOING_OFF_ANGLE_DEG);
+    const bool kept = same(present, values, PARAMETER_TURN_ON_ANGLE_DEG) &&
+                      same(present, values, PARAMETER_TURN_OFF_ANGLE_DEG) &&
+                      same(present, values, PARAMETER_OUTGOING_OFF_ANGLE_DEG);
+    const commutation_angles_t angles = parameters_commutation_angles(values);
     const commutation_parameters_t commutation =
         commutation_configure(&angles, machine_tables.phases, machine_tables.rotor_poles);
     if (!kept && !commutation_drives_forward(&commutation, &machine_tables, values[PARAMETER_CURRENT_LIMIT_A])) {

@@ -9,6 +9,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "control/commutation.h"
 #include "drive_enumerations.h"
 
 #define PARAMETER_NAME_MAX 24 /* characters */
@@ -82,6 +83,9 @@ bool parameters_tunable(unsigned index);
  */
 parameters_verdict_t parameters_check(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                       uint64_t written, const parameters_conditions_t *conditions);
+
+/* Angles of commutation of a set. */
+commutation_angles_t parameters_commutation_angles(const int32_t values[PARAMETER_COUNT]);
 
 /* Sum of the values of a set, modulo 2^32: another one after a change of any one of them. */
 uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]);
