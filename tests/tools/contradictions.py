@@ -28,7 +28,7 @@ FILES = sorted([*MACHINES.glob("*.toml"), *EXAMPLE_MACHINES.glob("*.toml"), *(RO
 
 @dataclass(frozen=True)
 class Legal:
-    """A machine that is none."""
+    """A machine file without a contradiction, and what follows from it."""
 
     text: str
     machine: Machine

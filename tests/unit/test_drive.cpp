@@ -938,7 +938,7 @@ TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     EXPECT_FALSE(drive.comms.commands.arming.configuring);
 }
 
-// What a set copies, applies and stores has not changed in memory since it was set.
+// A set copies, applies and stores only values that have not changed in memory since they were set.
 TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into_effect_nor_stored) {
     periods(100);
     const int32_t trip_q9 = drive.control_parameters.protection.current_trip_q9;

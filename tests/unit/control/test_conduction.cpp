@@ -498,7 +498,7 @@ class ConductionRounding : public Conduction {
   protected:
     static constexpr wide_integer::wide_t ONE_Q15 = 32768;
 
-    // Of a way between two values, to the nearest 4 LSB; `more`: for the same of what it begins and ends with.
+    // A part of the way between two values, to the nearest 4 LSB; `more`: what the ends add to that.
     static void expect_blend(uint32_t found, uint32_t from, uint32_t to, wide_integer::wide_t part_q15, const char *of,
                              int more = 0) {
         const wide_integer::wide_t way_q15 = int32_t(to - from) * part_q15;
@@ -546,7 +546,7 @@ class ConductionRounding : public Conduction {
 
     unsigned index_q8() const { return progress.place.k * 256 + unsigned(progress.place.fraction_q8); }
 
-    // Of the machine's windows, 2^-32 rev: to 2^-24.
+    // Angles of the machine's windows, 2^-32 rev: to 2^-24.
     uint32_t window_angle(int32_t magnitude_q24, int16_t machine_sharing_window_t::*side) const {
         using namespace wide_integer;
         const wide_t quarters_q8 = rounded_down(magnitude_q24, 65536) * 4 * 256 / tables.sharing_torque;

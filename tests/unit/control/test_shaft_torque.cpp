@@ -109,7 +109,7 @@ TEST_F(ShaftTorque, follows_a_change_of_the_gain_and_overflows_nothing) {
     }
 }
 
-// A factor beyond 1/12 is none, whatever the sums are.
+// A factor beyond 1/12 is not used, whatever the sums are.
 TEST_F(ShaftTorque, is_within_its_limits_with_any_bit_of_the_sums_changed) {
     windows(100, 1.05, 1.0);
     for (int64_t shaft_torque_t::*sum : {&shaft_torque_t::variance, &shaft_torque_t::covariance}) {

@@ -234,7 +234,7 @@ def open_log(path: Path, machine: str | None = None, node: int = 0, source: str 
              rotation: Rotation | None = None) -> Log:
     """A log by its suffix. machine, node: those whose DBC decodes the frames of MF4, CSV and Parquet, by default the
     machine that the drive reports. source: of the frames, for messages. rotation: see RotatingLog. UsageError: the
-    suffix is none of LOG_SUFFIXES, or the file cannot be made."""
+    suffix is not one of LOG_SUFFIXES, or the file cannot be made."""
     if path.suffix not in LOG_SUFFIXES:
         raise UsageError(f"--out {path}: the suffix must be {either(LOG_SUFFIXES)}")
     carrier = Carrier(source or str(path), machine, node) if path.suffix in DECODED_SUFFIXES else None
