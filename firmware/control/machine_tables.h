@@ -136,6 +136,7 @@ typedef struct {
     int32_t speed_reference_max;  /* magnitude of a command, LSBs of DRIVE_COMMAND.speed_reference_rpm */
     int32_t speed_max_q22;        /* highest speed of the machine, to which references are limited, rad/s, Q9.22 */
     uint32_t dbc_hash;            /* of the machine's CAN database, comms/drive.dbc with its factors and ranges */
+    uint32_t machine_hash;        /* of the values of the machine file and its map, which tools know the machine by */
 } machine_tables_t;
 
 /* The machine. On a target a constant, which the laws are compiled for when a drive is linked; on the host a variable,

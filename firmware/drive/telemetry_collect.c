@@ -186,6 +186,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->identity.firmware_minor = SALIENT_VERSION_MINOR;
     telemetry->identity.firmware_patch = SALIENT_VERSION_PATCH;
     telemetry->identity.dbc_hash = machine_tables.dbc_hash;
+    telemetry->machine.machine_hash = machine_tables.machine_hash;
 
     telemetry->heartbeat.state = control->state_machine.state;
     telemetry->heartbeat.fault = record->fault;

@@ -20,12 +20,14 @@ from salient.bus.log import write_logs
 from salient.bus.log_reader import convert
 from salient.bus.monitor import monitor, record
 from salient.bus.signals import drive_database
-from salient.config import BenchConfig
+from salient.config import DEFAULTS, BenchConfig
 from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine import cache
+from salient.machine.cache import machine_hash
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine
+from salient.machine.path import machine_path
 from salient.paths import EXAMPLE_MACHINES, ROOT
 from salient.version import VERSION
 from salient.view.command import LogFeed
@@ -36,7 +38,8 @@ def test_drive_reports_version_and_hash(bench, capsys):
     parts = [bench.telemetry[f"firmware_{part}"].last for part in ("major", "minor", "patch")]
     assert ".".join(f"{part:g}" for part in parts) == VERSION
     assert bench.telemetry["dbc_hash"].last == database_hash(drive_database())
-    assert bench.telemetry.count("DRIVE_IDENTITY") == 3
+    assert bench.telemetry["machine_hash"].last == machine_hash(machine_path(bench.machine or DEFAULTS["machine"]))
+    assert bench.telemetry.count("DRIVE_IDENTITY") == bench.telemetry.count("DRIVE_MACHINE") == 3
     assert "carries" not in capsys.readouterr().err
 
 
@@ -139,6 +142,54 @@ def test_every_tool_refuses_another_machine_than_stated_in_one_line(other_drive,
         runs[tool](None)
     assert sorted(path.name for path in tmp_path.glob("*.mf4")) == []
     assert not (tmp_path / "p.toml").exists()
+
+
+@pytest.fixture(params=["finite_element", "linear_cosine"])
+def bundled_drive(request, tmp_path):
+    """The bus of a running drive of a bundled machine that has the DBC of the default one; its name."""
+    can = f"unix:{tmp_path}/can.sock"
+    assert database_hash(drive_database(request.param)) == database_hash(drive_database())
+    with EmulatorProcess(BenchConfig(pace="x2", machine=request.param), can):
+        yield can, request.param
+
+
+def test_machines_of_one_database_are_told_apart(bundled_drive, tmp_path, capsys):
+    can, name = bundled_drive
+    record(can, tmp_path / "x.blf", 0.25, None)
+    assert LogFeed(tmp_path / "x.blf", Carrier("x.blf", None), 0).info["machine"]["name"] == name
+    with Session(can, lockstep=False) as session:
+        assert session.machine == name
+    assert capsys.readouterr().err == ""
+    LogFeed(tmp_path / "x.blf", Carrier("x.blf", "linear_trapezoid"), 0)
+    told = capsys.readouterr().err
+    assert re.search(rf"x\.blf: {CARRIES}{name}, not linear_trapezoid", told) and told.count("\n") == 1
+
+
+def test_a_log_without_the_machine_is_one_of_the_first_with_its_database(bundled_drive, tmp_path, capsys):
+    can, _ = bundled_drive
+    with Session(can, lockstep=False) as session:
+        session.run_for(0.25)
+        machine_id = drive_database().get_message_by_name("DRIVE_MACHINE").frame_id
+        write_logs([timed for timed in session.log if timed[1].arbitration_id != machine_id], tmp_path / "x.blf")
+    assert LogFeed(tmp_path / "x.blf", Carrier("x.blf", None), 0).info["machine"]["name"] == "saturating"
+    assert capsys.readouterr().err == ""
+
+
+def test_the_hash_of_a_machine_is_one_of_its_values(tmp_path):
+    file, map_file = tmp_path / "map86.toml", tmp_path / "map86.csv"
+    for copy in (file, map_file):
+        shutil.copy(EXAMPLE_MACHINES / copy.name, copy)
+    text = file.read_text(encoding="utf-8")
+    before = machine_hash(file)
+    value = re.search(r"^inertia_kg_m2 = .*$", text, re.MULTILINE)[0]
+    rewritten = "\ufeff# another comment\n" + text.replace("\n[", "\n\n\n[").replace(" = ", "   =  ")
+    file.write_text(rewritten, encoding="utf-8")
+    assert machine_hash(file) == before
+    file.write_text(text.replace(value, "inertia_kg_m2 = 0.0123"), encoding="utf-8")
+    assert machine_hash(file) != before
+    file.write_text(text, encoding="utf-8")
+    map_file.write_bytes(map_file.read_bytes() + b"\n")
+    assert machine_hash(file) != before
 
 
 def test_a_log_without_an_identity_says_whose_signals_it_has(other_drive, tmp_path, capsys):

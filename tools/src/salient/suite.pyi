@@ -331,6 +331,8 @@ TelemetryName = Literal[
     "DRIVE_AVAILABLE_TORQUE.backward_limited_by",
     "load_exceeds",
     "DRIVE_AVAILABLE_TORQUE.load_exceeds",
+    "machine_hash",
+    "DRIVE_MACHINE.machine_hash",
     "operation",
     "PARAMETER_RESPONSE.operation",
     "index",

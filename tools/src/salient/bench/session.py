@@ -120,7 +120,6 @@ class Session(KnownAttributes):
         self.log = []
         self.sent = []
         self._carrier = Carrier(address, machine, node, option=machine_option)
-        self._identity_id = drive_database(None, node).get_message_by_name("DRIVE_IDENTITY").frame_id
         self._tables: list[SignalTable] = []
         self.drives = []
         self._signals = signals
@@ -335,7 +334,7 @@ class Session(KnownAttributes):
         self.log.append(timed)
         for table in self._tables:
             table.add(time_ns, message)
-        if self._tables and message.arbitration_id == self._identity_id:
+        if self._tables and self._carrier.concerns(message):
             self._check_identity(message)
         return message
 

@@ -1,13 +1,15 @@
-"""The machine that a drive carries, by the hash of its DBC in DRIVE_IDENTITY: every tool that decodes a drive's frames
-asks `Carrier`, so that none decodes those of one machine with the factors of another.
+"""The machine that a drive carries, by the hashes in DRIVE_IDENTITY and DRIVE_MACHINE: every tool that decodes a drive's
+frames asks `Carrier`, so that none decodes those of one machine with the factors of another.
 
 Candidates, in their order: the machine that a note beside a log names, the default, the bundled ones, those of the
 examples, and every machine that a drive has been started with here (salient.machine.cache keeps their files). Machines
-with the same DBC are equal to what decodes; a picture of the machine is that of the first.
+with the same DBC are equal to what decodes; the hash of the machine tells them apart. A machine that is not known here
+but has the DBC of one that is, is decoded as that one, and said to be another.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
@@ -18,7 +20,7 @@ from salient.bus.signals import drive_database
 from salient.config import DEFAULTS
 from salient.dbc import database_hash
 from salient.errors import RunFailed, UsageError
-from salient.machine.cache import kept_machines
+from salient.machine.cache import kept_machines, machine_hash
 from salient.machine.file import MachineError, machine_path
 from salient.paths import EXAMPLE_MACHINES, MACHINES
 
@@ -57,13 +59,25 @@ def _first(reported: int, noted: str | None) -> str | None:
     return next(machines_of(reported, noted), None)
 
 
+@lru_cache
+def _machine_hash(machine: str) -> int:
+    """Hash of a machine by name or file; MachineError."""
+    return machine_hash(machine_path(machine))
+
+
+@lru_cache
+def _same(reported: int, carried: int, noted: str | None) -> str | None:
+    """The machine of these hashes, of DBC and machine."""
+    return next((machine for machine in machines_of(reported, noted) if _machine_hash(machine) == carried), None)
+
+
 class Carrier:
     """The machine of the drive with a node number, from the frames of its bus or log.
 
     where: the bus or log, for messages. given: the machine that the user states; another one than the drive's is
     refused, as is a drive whose machine is not known here (OtherDatabase, one line). option: how the user states it.
     noted: a machine that need not be right. machine: name or file, None before the drive has reported its identity.
-    UsageError: there is no such machine.
+    A drive whose machine is another one of the same DBC is one line on stderr. UsageError: there is no such machine.
     """
 
     def __init__(self, where: str, given: str | None, node: int = 0, *, option: str = "--machine",
@@ -74,8 +88,12 @@ class Carrier:
             raise UsageError(str(error)) from None
         self.machine: str | None = None
         self._where, self._node, self._option, self._noted, self._stated = where, node, option, noted, given
-        self._identity = drive_database(None, node).get_message_by_name("DRIVE_IDENTITY")
+        database = drive_database(None, node)
+        self._identity, self._machine = map(database.get_message_by_name, ("DRIVE_IDENTITY", "DRIVE_MACHINE"))
+        self._lengths = {frame.frame_id: frame.length for frame in (self._identity, self._machine)}
         self._reported: int | None = None
+        self._carried: int | None = None
+        self._settled = False
 
     @property
     def likely(self) -> str:
@@ -83,22 +101,37 @@ class Carrier:
         return self.machine or self._stated or self._noted or str(DEFAULTS["machine"])
 
     def take(self, message: can.Message) -> bool:
-        """Takes a frame; True once the machine is known. OtherDatabase: see above, and when the drive becomes another
-        one."""
-        if (message.arbitration_id == self._identity.frame_id and not message.is_extended_id
-                and not message.is_remote_frame and not message.is_error_frame and not message.is_fd
-                and len(message.data) == self._identity.length):
-            self._take_identity(bytes(message.data))
-        return self.machine is not None
+        """Takes a frame; True once the machine is known: DRIVE_MACHINE comes just before DRIVE_IDENTITY, whose second one
+        is taken without. OtherDatabase: see above, and when the drive becomes another one."""
+        if self.concerns(message):
+            if message.arbitration_id == self._machine.frame_id:
+                self._take_machine(bytes(message.data))
+            else:
+                self._take_identity(bytes(message.data))
+        return self._settled
+
+    def concerns(self, message: can.Message) -> bool:
+        """Whether a frame says which machine the drive carries."""
+        return (message.arbitration_id in self._lengths
+                and len(message.data) == self._lengths[message.arbitration_id]
+                and not (message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd))
+
+    def _take_machine(self, data: bytes) -> None:
+        values: dict[str, Any] = dict(self._machine.decode_simple(data))
+        carried = int(values["machine_hash"])
+        if self._settled and self._carried not in {None, carried}:
+            raise OtherDatabase(f"{self._where}: the drive with node number {self._node} has become one of another "
+                                "machine; start again")
+        self._carried = carried
 
     def _take_identity(self, data: bytes) -> None:
         identity: dict[str, Any] = dict(self._identity.decode_simple(data))
         reported = int(identity["dbc_hash"])
-        if reported == self._reported:
+        if self._settled and reported == self._reported:
             return
         version = ".".join(str(identity[f"firmware_{part}"]) for part in ("major", "minor", "patch"))
         drive = f"{self._where}: the drive with node number {self._node} (firmware {version})"
-        if self._reported is not None:
+        if self._reported not in {None, reported}:
             raise OtherDatabase(f"{drive} has become one of another machine: its database {reported:08x} was "
                                 f"{self._reported:08x}; start again")
         if self._given is None:
@@ -107,7 +140,19 @@ class Carrier:
             machine = self._stated if reported == self._given else None
         if machine is None:
             raise OtherDatabase(f"{drive} {self._refusal(reported)}")
+        self._settled = self._carried is not None or self._reported is not None
         self._reported, self.machine = reported, machine
+        if self._carried is not None:
+            self._tell_apart(drive, reported, self._carried)
+
+    def _tell_apart(self, drive: str, reported: int, carried: int) -> None:
+        """The machine among those of the same DBC; a line when it is none that is known, or not the stated one."""
+        same = _same(reported, carried, self._noted)
+        if self._given is None and same is not None:
+            self.machine = same
+        elif same is None or _machine_hash(str(self.machine)) != carried:
+            print(f"salient: {drive} carries {same or f'a machine that is not known here, {carried:08x}'}, not "
+                  f"{self.machine}: the same signals, other constants", file=sys.stderr, flush=True)
 
     def _refusal(self, reported: int) -> str:
         if self._given is None:

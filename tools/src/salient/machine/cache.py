@@ -9,8 +9,10 @@ kept, under the hash of the drive's DBC, which a drive sends: its frames can be 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import tomllib
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -108,6 +110,30 @@ def content_key(path: Path) -> str:
     for content in (machine, *map(_content, map_of(path, machine))):
         digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()[:32]
+
+
+def machine_hash(path: Path) -> int:
+    """CRC-32 of the values of a machine file, whatever their order, comments and layout, and of its map as it is: what
+    DRIVE_MACHINE reports. MachineError: not a file of TOML."""
+    content = _content(path)
+    try:
+        values = tomllib.loads(content.decode("utf-8-sig"))
+        text = json.dumps(_normal(values), sort_keys=True, separators=(",", ":"), default=str)
+    except (ValueError, RecursionError) as error:
+        raise MachineError(f"{path}: {error}") from None
+    crc = zlib.crc32(text.encode())
+    for file in map_of(path, content):
+        crc = zlib.crc32(_content(file), crc)
+    return crc
+
+
+def _normal(value: Any) -> Any:
+    """A value of a TOML file in which 1 and 1.0 are the same."""
+    if isinstance(value, dict):
+        return {key: _normal(element) for key, element in value.items()}
+    if isinstance(value, list):
+        return [_normal(element) for element in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def map_of(path: Path, machine: bytes) -> list[Path]:

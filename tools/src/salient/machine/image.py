@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from salient.dbc import database_hash
+from salient.machine.cache import machine_hash
 from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
@@ -123,13 +124,15 @@ class FirmwareTables:
     phase_map: PhaseMap
     pulse: PulseTables
     sharing: SharingTables
+    machine_hash: int
+    """See salient.machine.cache."""
 
 
 def firmware_tables(path: Path | str, machine: Machine, scaling: Scaling) -> FirmwareTables:
     """The tables of a machine file's machine; MachineError when the formats cannot hold them."""
     window = sharing_window(machine, scaling.data)
     return FirmwareTables(machine_phase_map(path, machine, scaling.exponents), pulse_tables(machine, scaling, window),
-                          sharing_tables(window, scaling.exponents))
+                          sharing_tables(window, scaling.exponents), machine_hash(Path(path)))
 
 
 def _columns(torque: np.ndarray, flux: np.ndarray) -> np.ndarray:
@@ -208,6 +211,7 @@ TABLES = Structure("machine_tables_t", (
     Member("speed_reference_max", "int32_t", lambda machine, scaling, tables: scaling.speed_reference_max),
     Member("speed_max_q22", "int32_t", lambda machine, scaling, tables: scaling.speed_max_q22),
     Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
+    Member("machine_hash", "uint32_t", lambda machine, scaling, tables: tables.machine_hash),
 ))  # fmt: skip
 """Of a Machine, its Scaling and its FirmwareTables: firmware/control/machine_tables.h."""
 
