@@ -122,6 +122,7 @@ typedef struct {
 typedef struct {
     uint32_t encoder_angle;             /* start of the encoder count, 2^-32 rev */
     uint32_t angle;                     /* rotor, 2^-32 rev */
+    uint32_t half_count;                /* where the angle is the middle of a count; else 0; 2^-32 rev */
     bool angle_from_edge;               /* extrapolated from the time of an encoder edge; false: middle of the count */
     int32_t predicted_speed_q22;        /* observer's prediction for this sample, rad/s, Q9.22 */
     int32_t dc_link_voltage_q6;         /* V, Q9.6 */
@@ -179,6 +180,7 @@ typedef struct {
     uint32_t reported_fault_mask; /* failed checks of the background, which writes it in one access; FAULT_BITs */
     bool started;                 /* the first sample has initialised observer and protection */
     int32_t innovation;           /* of the last sample, 2^-32 rev */
+    int32_t correction;           /* of the observer by it, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
     protection_t protection;

@@ -60,6 +60,8 @@ void observe(const control_parameters_t *parameters, control_state_t *state, con
             : observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
                                       &measured->angle_from_edge);
     state->innovation = innovation;
+    state->correction = load_observer_correction(innovation, measured->half_count);
     const int32_t torque_q24 = fixed_subtract(measured->torque_sum_q24, deferred->speed.periodic_load_q24);
-    load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, innovation, torque_q24);
+    load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, state->correction,
+                       torque_q24);
 }

@@ -1,5 +1,5 @@
-"""The machine that a drive carries, by the hashes in DRIVE_IDENTITY and DRIVE_MACHINE: every tool that decodes a drive's
-frames asks `Carrier`, so that none decodes those of one machine with the factors of another.
+"""The machine that a drive carries, by the hashes in DRIVE_IDENTITY and DRIVE_MACHINE: every tool that decodes the
+frames of a drive asks `Carrier`, so that none decodes those of one machine with the factors of another.
 
 Candidates, in their order: the machine that a note beside a log names, the default, the bundled ones, those of the
 examples, and every machine that a drive has been started with here (salient.machine.cache keeps their files). Machines
@@ -101,8 +101,8 @@ class Carrier:
         return self.machine or self._stated or self._noted or str(DEFAULTS["machine"])
 
     def take(self, message: can.Message) -> bool:
-        """Takes a frame; True once the machine is known: DRIVE_MACHINE comes just before DRIVE_IDENTITY, whose second one
-        is taken without. OtherDatabase: see above, and when the drive becomes another one."""
+        """Takes a frame; True once the machine is known: DRIVE_MACHINE comes just before DRIVE_IDENTITY, whose second
+        one is taken without. OtherDatabase: see above, and when the drive becomes another one."""
         if self.concerns(message):
             if message.arbitration_id == self._machine.frame_id:
                 self._take_machine(bytes(message.data))
