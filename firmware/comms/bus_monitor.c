@@ -49,8 +49,7 @@ COLD void bus_monitor_step(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us)
     } else if (was_off || monitor->status.state != HAL_CAN_ERROR_ACTIVE) {
         monitor->since_us = time_us;
     } else if (time_us - monitor->since_us >= BUS_MONITOR_ERROR_FREE_US) {
-        monitor->wait_us = BUS_MONITOR_WAIT_MIN_US;
-        monitor->since_us = time_us - BUS_MONITOR_ERROR_FREE_US; /* its age does not wrap */
+        monitor->wait_us = BUS_MONITOR_WAIT_MIN_US; /* and remains so until bus-off, when the clock comes round too */
     }
 }
 

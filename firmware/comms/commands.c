@@ -34,6 +34,11 @@ static bool must_disarm(const commands_t *commands, uint32_t time_us, uint32_t t
            (!commands->used && time_us - commands->armed_us > COMMANDS_ARMED_UNUSED_US);
 }
 
+/* Another sender is forgotten when its frames have not come for long enough. */
+static void expire_contest(commands_t *commands, uint32_t time_us) {
+    commands->contested = commands->contested && time_us - commands->contested_us < COMMANDS_SENDER_LOST_US;
+}
+
 COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t time_us, uint32_t timeout_us) {
     if (state == DRIVE_STATE_RUN && commands->state != DRIVE_STATE_RUN) {
         arming_end_configuration(&commands->arming);
@@ -48,6 +53,7 @@ COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t
     }
     if (!commands->arming.armed && time_us - commands->last_received_us > timeout_us) {
         e2e_receiver_restart(&commands->receiver);
+        expire_contest(commands, time_us); /* in silence nothing else does, and the clock comes round */
     }
 }
 
@@ -119,7 +125,7 @@ static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_
         commands->arming.armed || time_us - commands->last_received_us < COMMANDS_SENDER_LOST_US;
     switch (e2e_check(&commands->receiver, data_id_of_node, frame->data, frame->length)) {
     case E2E_ACCEPTED:
-        commands->contested = commands->contested && time_us - commands->contested_us < COMMANDS_SENDER_LOST_US;
+        expire_contest(commands, time_us);
         return true;
     case E2E_RESYNCHRONISED:
         commands->contested = false;

@@ -26,7 +26,6 @@ void e2e_receiver_init(e2e_receiver_t *receiver) {
 void e2e_receiver_restart(e2e_receiver_t *receiver) {
     receiver->synchronised = false;
     receiver->locked = false;
-    receiver->candidate_frames = 0;
 }
 
 static bool in_sequence(uint8_t before, uint8_t counter) {

@@ -265,8 +265,6 @@ static bool shows(const common_t *common, angle_evidence_phase_t *state) {
         state->shown_from = state->shown ? state->shown_from : period;
         state->shown = true;
         state->shown_at = period;
-    } else if (period - state->shown_at > common->parameters->rate_hz >> SHOWN_SHIFT) {
-        state->shown = false;
     }
     return state->shown;
 }
@@ -280,16 +278,25 @@ static void note_agreement(const common_t *common, angle_evidence_phase_t *state
     }
 }
 
+/* Forgets what is longer ago than it counts, before the number of the period comes round. */
+static void forget_old(const common_t *common, angle_evidence_t *state) {
+    const uint32_t period = common->residual->sample.periods, rate_hz = common->parameters->rate_hz;
+    state->advanced = state->advanced && period - state->advanced_at <= rate_hz >> ALONE_SHIFT;
+    for (unsigned phase = 0; phase < common->residual->phases; phase++) {
+        angle_evidence_phase_t *one = &state->phase[phase];
+        one->agreed = one->agreed && period - one->agreed_at <= rate_hz >> SHOWN_SHIFT;
+        one->shown = one->shown && period - one->shown_at <= rate_hz >> SHOWN_SHIFT;
+    }
+}
+
 /* True when two of the other phases, or all that are not lost, have been consistent with the angle in the last quarter
  * of a second. One that is left is enough: what it has shown, it contradicts when it conducts the next time, if the
  * encoder is wrong. */
-static bool others_agree(const common_t *common, angle_evidence_t *state, unsigned index) {
+static bool others_agree(const common_t *common, const angle_evidence_t *state, unsigned index) {
     bool all = true;
     unsigned agreeing = 0;
     for (unsigned other = 0; other < common->residual->phases; other++) {
-        angle_evidence_phase_t *phase = &state->phase[other];
-        const uint32_t since = common->residual->sample.periods - phase->agreed_at;
-        phase->agreed = phase->agreed && since <= common->parameters->rate_hz >> SHOWN_SHIFT;
+        const angle_evidence_phase_t *phase = &state->phase[other];
         if (other != index && (common->residual->sample.lost_phases >> other & 1u) == 0) {
             all &= phase->agreed;
             agreeing += phase->agreed;
@@ -311,7 +318,7 @@ static bool advances(const common_t *common, angle_evidence_t *state) {
         state->advanced = true;
         state->advanced_at = sample->periods;
     }
-    return state->advanced && sample->periods - state->advanced_at <= common->parameters->rate_hz >> ALONE_SHIFT;
+    return state->advanced;
 }
 
 static void check_phase(const common_t *common, angle_evidence_t *state, unsigned index, bool counted,
@@ -336,10 +343,10 @@ static void check_phase(const common_t *common, angle_evidence_t *state, unsigne
     evidence->contradicts |= (uint32_t)shows(common, phase_state) << index;
 }
 
-/* A run that has ended leaves nothing but `parted`. */
+/* A run that has ended leaves nothing that counts but `parted`: an advance is forgotten sooner than a contradiction may
+ * last. */
 static void forget(angle_evidence_t *state, uint32_t encoder_angle) {
     state->counted = false;
-    state->advanced = false;
     state->waypoint = encoder_angle;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         state->phase[phase].referred = false;
@@ -365,6 +372,7 @@ COLD void angle_evidence_step(const angle_evidence_parameters_t *parameters, ang
     }
     if (residual->sample.run) {
         const common_t common = common_of(parameters, residual, state->counted);
+        forget_old(&common, state);
         const bool next_decides = advances(&common, state);
         for (unsigned phase = 0; phase < residual->phases; phase++) {
             check_phase(&common, state, phase, counted, evidence);

@@ -24,12 +24,13 @@
  * since a reset of the drive, whose rotor may turn backwards, is no turn round. */
 static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear, uint32_t rate_hz) {
     const bool backwards = turned < 0;
+    monitor->turned =
+        monitor->turned && monitor->window_period - monitor->turned_at <= REVERSAL_WINDOWS * (rate_hz >> WINDOW_SHIFT);
     if (!clear) {
         return;
     }
-    if (monitor->turned && backwards != monitor->backwards &&
-        monitor->window_period - monitor->turned_at <= REVERSAL_WINDOWS * (rate_hz >> WINDOW_SHIFT)) {
-        monitor->reversed = true;
+    if (monitor->turned && backwards != monitor->backwards) {
+        monitor->turned_round = true;
         monitor->reversed_at = monitor->window_period;
     }
     monitor->turned = true;
@@ -74,5 +75,5 @@ COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, e
     }
     check_speed(parameters, monitor, residual);
     monitor->turned_round =
-        monitor->reversed && sample->periods - monitor->reversed_at <= parameters->rate_hz >> REVERSED_SHIFT;
+        monitor->turned_round && sample->periods - monitor->reversed_at <= parameters->rate_hz >> REVERSED_SHIFT;
 }

@@ -24,15 +24,15 @@ typedef struct {
 } encoder_monitor_parameters_t;
 
 typedef struct {
-    bool over_speed, turned_round;
+    bool over_speed;
+    bool turned_round; /* faster than a rotor, last in the period reversed_at, a short time ago */
+    uint32_t reversed_at;
     bool started;           /* the next two are set */
     uint32_t window_period; /* of the start of the window for the speed */
     uint32_t window_angle;
-    bool turned;    /* a window had a clear travel */
+    bool turned;    /* a window had a clear travel a short time ago */
     bool backwards; /* direction of the last one, which ended in the period turned_at */
     uint32_t turned_at;
-    bool reversed; /* faster than a rotor, last in the period reversed_at */
-    uint32_t reversed_at;
 } encoder_monitor_t;
 
 /* Checks a sample. [background] */

@@ -69,6 +69,8 @@ COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *in
     const bool before = monitor->vain && monitor->forward == forward;
     if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
         monitor->backwards_us = time_us;
+    } else if (time_us - monitor->backwards_us > STALL_TIME_US) {
+        monitor->backwards_us = time_us - STALL_TIME_US - 1u; /* its age does not wrap */
     }
     const bool backwards = time_us - monitor->backwards_us <= STALL_TIME_US;
     const bool begins = !input->speed_mode || monitor->forward != forward;

@@ -37,7 +37,7 @@ typedef struct {
 typedef struct {
     uint32_t changed_us;             /* when the speed last left its range, or there was none */
     int32_t lowest_q22, highest_q22; /* range of the speed in the direction of its reference, rad/s, Q9.22 */
-    uint32_t backwards_us;           /* when the rotor last turned against the reference */
+    uint32_t backwards_us;           /* when the rotor last turned against the reference, or longer ago than counts */
     bool forward;                    /* the speed reference at the last call */
     bool vain;                       /* torque and speed of a stall at the last call */
     uint32_t electrical;             /* at the last call, 2^-32 electrical rev */

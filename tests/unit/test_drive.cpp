@@ -36,6 +36,7 @@ struct hal {
     std::array<uint16_t, HAL_ADC_TEMPERATURES> temperature_code = warm();
     hal_memory_t memory{};
     bool registers_intact = true;
+    unsigned encoder_bits = 17;
     uint32_t encoder_counts = 1000;
     uint32_t time_us = 0;
     uint32_t clock_hz = 200000000;
@@ -90,8 +91,8 @@ bool hal_registers_intact(const hal_t *hal) {
 uint32_t hal_time_reference_us(const hal_t *hal) {
     return hal->time_us;
 }
-unsigned hal_encoder_bits(const hal_t *) {
-    return 17;
+unsigned hal_encoder_bits(const hal_t *hal) {
+    return hal->encoder_bits;
 }
 void hal_encoder_read(const hal_t *hal, hal_encoder_sample_t *sample) {
     *sample = {};
@@ -679,7 +680,7 @@ TEST_F(Drive, reports_that_it_is_not_armed_with_its_first_telemetry) {
 }
 
 TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
-    periods(100);
+    periods(150); // telemetry is due 0.25 ms later
     hal.from_drive.clear();
     hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
     periods(1);
@@ -698,7 +699,7 @@ TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
     EXPECT_EQ(armed.armed, 1);
     EXPECT_EQ(armed.challenge, 0u);
     hal.from_drive.clear();
-    periods(40);
+    periods(200);
     EXPECT_GE(hal.from_drive.size(), 4u) << "telemetry goes on";
     hal.from_drive.clear();
     for (int k = 0; k < 10; k++) {
@@ -748,6 +749,25 @@ TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
         periods(405);
         EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     }
+}
+
+// With coarse counts 16 bits of the angle show where in its count it is.
+TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_period_of_the_fault) {
+    hal.encoder_bits = 10;
+    hal.encoder_counts = 300;
+    hal.open = true;
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    hal.encoder_counts = 301;
+    hal.break_causes = HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2;
+    periods(1);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    EXPECT_EQ(fault_trace_period(&drive.trace, FAULT_TRACE_PERIODS - 1)->adc.load_torque_counts, 64 * 301)
+        << "within the count as near as possible to the prediction";
+    EXPECT_EQ(fault_trace_period(&drive.trace, FAULT_TRACE_PERIODS - 2)->adc.load_torque_counts, 64 * 300 + 32);
+    EXPECT_EQ(fault_trace_period(&drive.trace, 0)->adc.load_torque_counts, 64 * 300 + 32);
+    EXPECT_EQ(fault_trace_period(&drive.trace, FAULT_TRACE_PERIODS), nullptr);
 }
 
 TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {

@@ -473,6 +473,53 @@ TEST_F(Commands, what_disarms) {
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+TEST_F(Commands, an_arming_begins_without_errors_use_or_run_of_the_one_before) {
+    arm(1, 10000);
+    for (unsigned i = 0; i + 1 < COMMANDS_ERRORS_MAX; i++) {
+        take(command_frame(99), DRIVE_STATE_RUN, 11000);
+    }
+    ASSERT_EQ(commands.errors, (COMMANDS_ERRORS_MAX - 1) * COMMANDS_ERROR_STEP);
+    take(command_frame(2, COMMAND_OFF), DRIVE_STATE_RUN, 12000);
+    ASSERT_FALSE(commands.arming.armed);
+    ASSERT_FALSE(commands.failed);
+    // Armed by a sender that is still off; what came out of sequence before has to be forgotten.
+    uint32_t time_us = 12000 + COMMANDS_SENDER_LOST_US;
+    take(command_frame(3, COMMAND_OFF), DRIVE_STATE_READY, time_us);
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, time_us);
+    take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, time_us + 1000);
+    for (uint8_t counter = 4; counter < 10; counter++) {
+        take(command_frame(counter, COMMAND_OFF), DRIVE_STATE_READY, time_us += 10000);
+        ASSERT_TRUE(commands.arming.armed) << "no run has been requested since";
+    }
+    take(command_frame(10), DRIVE_STATE_READY, time_us + 1000);
+    for (unsigned i = 0; i + 1 < COMMANDS_ERRORS_MAX; i++) {
+        take(command_frame(99), DRIVE_STATE_RUN, time_us + 2000);
+        EXPECT_FALSE(commands.failed) << i;
+    }
+    EXPECT_TRUE(commands.arming.armed);
+}
+
+TEST_F(Commands, a_frame_that_comes_twice_does_not_prevent_the_arming) {
+    take(command_frame(1), DRIVE_STATE_READY, 1000);
+    EXPECT_EQ(take(command_frame(1), DRIVE_STATE_READY, 2000), COMMANDS_REJECTED);
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 3000);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 4000),
+              COMMANDS_COMMAND);
+    EXPECT_TRUE(commands.arming.armed);
+}
+
+TEST_F(Commands, a_second_sender_of_71_minutes_ago_does_not_prevent_the_arming) {
+    take(command_frame(1), DRIVE_STATE_READY, 1000);
+    EXPECT_EQ(take(command_frame(50), DRIVE_STATE_READY, 2000), COMMANDS_REJECTED);
+    for (uint32_t quarter = 0; quarter < 4; quarter++) {
+        supervise(DRIVE_STATE_READY, 2000 + (quarter << 30)); // silence
+    }
+    take(command_frame(2), DRIVE_STATE_READY, 2100); // the clock has come round
+    take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2100);
+    EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 3100),
+              COMMANDS_COMMAND);
+}
+
 TEST_F(Commands, armed_without_a_request_to_run_lasts_half_a_second) {
     take(command_frame(0, COMMAND_OFF), DRIVE_STATE_READY, 1000);
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);

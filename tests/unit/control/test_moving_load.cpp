@@ -416,4 +416,16 @@ TEST(MovingLoad, the_trend_moves_by_its_exact_product_rounded_down) {
     EXPECT_NE(expected_q36, 0);
 }
 
+TEST(MovingLoad, triggers_after_the_first_release_do_not_keep_a_load_that_has_moved_from_being_forgotten) {
+    Detector detector;
+    while (detector.step(COUNT / 4) == 0) {
+    }
+    EXPECT_EQ(detector.step(0, FAST, false, false, true), 0u) << "it may have been a load step";
+    ASSERT_GT(detector.state.hold_ticks, 0u);
+    for (uint32_t k = 1; k <= RATE_HZ / 2; k++) {
+        EXPECT_EQ(detector.step(0, FAST, false, false, k % (RATE_HZ / 100) == 0), 0u);
+    }
+    EXPECT_EQ(detector.state.hold_ticks, 0u) << "the next one is a first one";
+}
+
 } // namespace

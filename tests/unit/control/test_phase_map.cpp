@@ -423,4 +423,12 @@ TEST(PhaseMap, tables_of_extreme_entries_do_not_overflow) {
     EXPECT_GT(largest, 1 << 28);
 }
 
+TEST(PhaseMap, flux_of_a_current_below_0_is_that_of_none) {
+    for (const uint32_t distance : {0u, 1u << 30, (1u << 31) - 1}) {
+        for (const int32_t current_q9 : {-1, -1 << 12, -CURRENT_END_Q9, INT32_MIN}) {
+            EXPECT_EQ(phase_map_flux_q29(&machine_tables, distance, current_q9), 0) << distance << " " << current_q9;
+        }
+    }
+}
+
 } // namespace

@@ -684,4 +684,29 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
     }
 }
 
+// At standstill phase 0 makes the torque; the others are unaligned, where they can make none.
+TEST(PredictiveTorque, what_a_lost_phase_would_make_is_missing_in_both_directions) {
+    const torque_parameters_t p = parameters_of();
+    for (const double reference_Nm : {4.0, -4.0}) {
+        const double angle_rev = reference_Nm > 0 ? 0.75 : 0.25;
+        const double current_A = TABLES.current_of_torque(0.75, 4.0);
+        const int32_t current_q9[HAL_PHASES_MAX] = {to_fixed(current_A, Q9)};
+        const int32_t flux[HAL_PHASES_MAX] = {to_fixed(TABLES.flux(0.75, current_A), Q29) >>
+                                              machine_tables.flux_format.result_shift};
+        for (const unsigned lost : {0u, 1u, 2u}) {
+            predictive_torque_t control;
+            predictive_torque_reset(&control);
+            int32_t duty_q15[HAL_PHASES_MAX] = {};
+            for (int k = 0; k < 20; k++) { // of them some until the column is found
+                const placed_t placed(p, {uint32_t(angle_rev * REV), 0u, 0u});
+                predictive_torque_sample_t sample = placed.sample(p, current_q9, flux, to_fixed(reference_Nm, Q24));
+                sample.lost_phase = lost;
+                std::fill_n(control.duty_q15, PHASES, 0); // the flux linkage is kept
+                predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
+            }
+            EXPECT_NEAR(control.torque_shortfall_q24 / Q24, lost == 1 ? reference_Nm : 0.0, 0.2) << lost;
+        }
+    }
+}
+
 } // namespace

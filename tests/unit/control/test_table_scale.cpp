@@ -354,4 +354,18 @@ TEST(TableScaleFactors, a_torque_times_a_factor_is_rounded_to_2_lsb_and_saturate
     EXPECT_GT(saturating, 1000);
 }
 
+TEST(TableScaleFollow, the_resistance_follows_by_a_quarter_of_the_part_by_which_the_scale_follows) {
+    table_scale_t state;
+    table_scale_reset(&state);
+    state.differs = true;
+    state.scale_q30 = to_fixed(1.2, Q30);
+    state.resistance_q40 = 1 << 20;
+    const int32_t part_q31 = table_scale_part_q31(40000);
+    for (int k = 0; k < 8000; k++) { // 0.2 s, a time constant of the scale
+        table_scale_follow(&state, TABLE_SCALE_ONE_Q30, part_q31);
+    }
+    EXPECT_NEAR((state.smooth_q30 / Q30 - 1.0) / 0.2, 1.0 - std::exp(-1.0), 0.01);
+    EXPECT_NEAR(state.smooth_resistance_q40 / double(1 << 20), 1.0 - std::exp(-0.25), 0.01);
+}
+
 } // namespace

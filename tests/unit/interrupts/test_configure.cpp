@@ -407,4 +407,20 @@ TEST(Configure, every_default_is_within_its_range_and_every_name_fits) {
     }
 }
 
+TEST(Configure, the_torque_without_a_phase_is_that_of_the_controller_s_current_limit) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        parameters_t parameters;
+        parameters_init(&parameters);
+        parameters_set_controller(&parameters, controller);
+        const int32_t limit_q9 = parameters.values[PARAMETER_CURRENT_LIMIT_A] =
+            parameters.values[PARAMETER_CURRENT_TRIP_A];
+        const control_parameters_t control =
+            configure_control(&parameters, &machine_tables, 40000, 17, 12, fixed_point::TIMER_CLOCK_HZ);
+        const bool hysteresis = controller == DRIVE_CONTROLLER_TRADITIONAL;
+        ASSERT_LT(control.hysteresis.current_limit_q9, limit_q9) << "a margin for the overshoot of chopping";
+        EXPECT_EQ(control.degraded.current_limit_q9, hysteresis ? control.hysteresis.current_limit_q9 : limit_q9);
+    }
+}
+
 } // namespace

@@ -327,6 +327,28 @@ TEST_F(Control, a_rotor_that_turns_at_once_while_ready_is_caught_within_5_ms_by_
     }
 }
 
+// From the first period of a slip that it was measured in to the last one, a run lies between.
+TEST_F(Control, a_slip_of_the_observer_that_a_run_interrupts_is_measured_anew_after_it) {
+    configure_with(DRIVE_CONTROLLER_TRADITIONAL, PARAMETER_OBSERVER_BANDWIDTH_RAD_S, 200);
+    for (int k = 0; k < 100; k++) {
+        step(COMMAND_OFF);
+    }
+    speed_rad_s = fixed_point::rad_s(2900.0);
+    for (int k = 0; k < 50 && state.slip.periods < 5; k++) {
+        step(COMMAND_OFF);
+    }
+    ASSERT_EQ(state.slip.periods, 5u);
+    for (int k = 0; k < 60; k++) {
+        ASSERT_TRUE(step(COMMAND_RUN));
+    }
+    for (int k = 0; k < 200; k++) {
+        step(COMMAND_OFF);
+        EXPECT_LT(diagnostics.speed_q22 / fixed_point::Q22, 1.02 * speed_rad_s) << k;
+    }
+    EXPECT_NEAR(diagnostics.speed_q22 / fixed_point::Q22, speed_rad_s, 0.01 * speed_rad_s);
+    EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+}
+
 TEST_F(Control, the_reference_starts_at_the_present_speed_and_follows_the_ramp) {
     parameters.speed_ramp_q22 = fixed_point::to_fixed(0.01, fixed_point::Q22); // rad/s a period
     speed_rad_s = 20.0;

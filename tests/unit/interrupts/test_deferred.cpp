@@ -596,4 +596,117 @@ TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
     EXPECT_NEAR(results().bandwidth.holdoff_ticks, RATE_HZ / 1000.0 * 1.25, 1.0);
 }
 
+// The run that a step was requested in has ended, and the next one has begun, before the step has ended.
+TEST_F(Deferred, a_run_without_a_step_between_it_and_the_one_before_begins_at_the_present_speed) {
+    speed_rad_s = 20.0;
+    parameters.speed_ramp_q22 = 1 << 10;
+    start();
+    for (int k = 0; k < 4000; k++) {
+        period(COMMAND_RUN, 600.0);
+    }
+    ASSERT_GT(state.deferred.speed_reference_q22, state.observer.speed_q22 + 3000 * (1 << 10));
+    interrupt(COMMAND_RUN, 600.0); // this step will be late
+    EXPECT_FALSE(interrupt(COMMAND_OFF));
+    deferred_step(&parameters, &state, &command);
+    ASSERT_TRUE(interrupt(COMMAND_RUN, 600.0));
+    ASSERT_TRUE(state.deferred_request.input.run);
+    const int32_t speed_q22 = state.deferred_request.input.speed_q22;
+    deferred_step(&parameters, &state, &command);
+    EXPECT_EQ(results().speed.speed_reference_q22, speed_q22 + (1 << 10));
+}
+
+TEST_F(Deferred, a_run_in_torque_mode_without_a_step_between_it_and_the_one_before_begins_without_torque) {
+    parameters.torque_mode.slew_q24 = 1 << 20;
+    speed_rad_s = 20.0;
+    start();
+    for (int k = 0; k < 100; k++) {
+        torque_period(5.0);
+    }
+    ASSERT_GT(state.torque_reference_q24, 4 << 24);
+    command.mode = DRIVE_MODE_TORQUE;
+    interrupt(COMMAND_RUN);
+    deferred_compute(&parameters, &state, &command);
+    EXPECT_FALSE(interrupt(COMMAND_OFF)) << "pre-empts the step";
+    deferred_complete(&state.deferred_request, &state.deferred.response);
+    ASSERT_TRUE(interrupt(COMMAND_RUN));
+    deferred_step(&parameters, &state, &command);
+    EXPECT_EQ(results().speed.torque_max_q24, 1 << 20) << "slew rate from zero";
+}
+
+TEST_F(Deferred, a_run_begins_without_torque_offset_and_periodic_load_of_the_one_before) {
+    speed_rad_s = 20.0;
+    start();
+    for (int k = 0; k < 10; k++) {
+        period(COMMAND_RUN);
+    }
+    const auto nothing_left = [this] {
+        return torque_offset_q24(&state.deferred.torque_offset) == 0 && state.deferred.periodic_load.torque_q24 == 0 &&
+               !state.deferred.periodic_load.engaged;
+    };
+    state.deferred.torque_offset.offset_q56 = int64_t(1) << 56;
+    state.deferred.periodic_load.torque_q24 = 1 << 24;
+    state.deferred.periodic_load.engaged = true;
+    period(COMMAND_RUN);
+    ASSERT_FALSE(nothing_left());
+    EXPECT_EQ(results().speed.periodic_load_q24, 1 << 24);
+    period(COMMAND_OFF);
+    period(COMMAND_OFF);
+    EXPECT_TRUE(nothing_left());
+    ASSERT_TRUE(period(COMMAND_RUN));
+    const int32_t error_q22 = results().speed.speed_reference_q22 - state.deferred_request.input.speed_q22;
+    EXPECT_EQ(results().speed.speed_law_torque_q24, speed_smc_reaching_torque_q24(&parameters.speed_smc, error_q22));
+    EXPECT_EQ(results().speed.periodic_load_q24, 0);
+}
+
+TEST_F(Deferred, a_periodic_load_of_speed_mode_is_forgotten_in_torque_mode) {
+    speed_rad_s = 20.0;
+    start();
+    period(COMMAND_RUN);
+    state.deferred.periodic_load.torque_q24 = 1 << 24;
+    state.deferred.periodic_load.engaged = true;
+    for (int k = 0; k < 2 * DEFERRED_COMMON_PERIODS; k++) {
+        torque_period(1.0);
+    }
+    EXPECT_FALSE(state.deferred.periodic_load.engaged);
+    period(COMMAND_RUN);
+    period(COMMAND_RUN);
+    EXPECT_EQ(results().speed.periodic_load_q24, 0);
+}
+
+TEST_F(Deferred, a_frozen_encoder_is_found_as_soon_with_late_steps_as_without) {
+    for (const int late : {0, 7}) {
+        configure(DRIVE_CONTROLLER_SALIENT);
+        speed_rad_s = 20.0;
+        for (int k = 0; k < 4000; k++) {
+            period(COMMAND_OFF);
+        }
+        ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+        speed_rad_s = 0.0;
+        int periods = 0;
+        while (state.state_machine.state == DRIVE_STATE_READY && periods < 400) {
+            interrupt(COMMAND_OFF);
+            if (periods++ % (late + 1) == late) {
+                deferred_step(&parameters, &state, &command);
+            }
+        }
+        EXPECT_EQ(state.state_machine.record.fault, FAULT_ENCODER);
+        EXPECT_LT(periods, 40 + late) << late;
+    }
+}
+
+TEST_F(Deferred, a_trigger_is_handed_over_once) {
+    speed_rad_s = 5.0; // without slow counts
+    for (int k = 0; k < 60000; k++) {
+        period(COMMAND_OFF);
+    }
+    ASSERT_EQ(state.bandwidth.stage, OBSERVER_BANDWIDTH_STEADY_STAGE);
+    turns += 4.0 / (1 << ENCODER_BITS);
+    period(COMMAND_OFF);
+    EXPECT_NE(state.deferred_request.input.bandwidth.trigger, OBSERVER_TRIGGER_NONE);
+    for (int k = 0; k < 20; k++) {
+        period(COMMAND_OFF);
+        EXPECT_EQ(state.deferred_request.input.bandwidth.trigger, OBSERVER_TRIGGER_NONE) << k;
+    }
+}
+
 } // namespace

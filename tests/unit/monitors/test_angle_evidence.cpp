@@ -332,4 +332,64 @@ TEST_F(AngleEvidence, flux_linkage_that_no_angle_explains_is_no_error_of_the_enc
     }
 }
 
+// Phase 0 contradicts the angle for longer than 1/256 s, alone, a time after phases 1 and 2 have agreed for 2 ms each.
+TEST_F(AngleEvidence, an_agreement_speaks_for_the_encoder_for_a_quarter_of_a_second_and_within_its_run) {
+    const struct {
+        double since_s;
+        bool in_run, fails;
+    } cases[] = {{0.01, true, false}, {0.2, true, false}, {0.3, true, true}, {0.01, false, true}};
+    for (const auto &one : cases) {
+        monitor = {};
+        for (const unsigned phase : {1u, 2u}) {
+            input.zero_at[phase] = input.period + 1;
+            const double aligned_deg = 65.0 + 30.0 * phase;
+            for (int k = 0; k < RATE_HZ / 500; k++) {
+                step(aligned_deg, aligned_deg, 25.0, phase);
+            }
+        }
+        input.run = one.in_run;
+        for (int k = 0; k < RATE_HZ * one.since_s; k++) {
+            step(77.0, 65.0, 0.0);
+        }
+        input.run = true;
+        input.zero_at[0] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 150; k++) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(monitor.angle, one.fails) << one.since_s << " " << one.in_run;
+    }
+}
+
+TEST_F(AngleEvidence, a_contradiction_of_the_run_before_is_no_company_of_a_faulty_phase) {
+    input.zero_at[1] = input.period + 1;
+    for (int k = 0; k < 10; k++) {
+        step(95.0, 83.0, 25.0, 1);
+    }
+    ASSERT_TRUE(suspects(1));
+    input.run = false;
+    step(95.0, 95.0, 0.0);
+    input.run = true;
+    step(95.0, 95.0, 0.0);
+    EXPECT_FALSE(suspects(1));
+}
+
+// A phase that agreed, one that contradicted, and a rotor that advanced 2^32 periods ago have not done so now.
+TEST_F(AngleEvidence, what_is_long_ago_does_not_count_again_when_the_number_of_the_period_comes_round) {
+    input.torque_q24 = 1 << 24;
+    input.zero_at[1] = input.period + 1;
+    for (int k = 0; k < 10; k++) {
+        step(95.0 + k * 0.3, 83.0 + k * 0.3, 25.0, 1);
+    }
+    ASSERT_TRUE(suspects(1));
+    ASSERT_TRUE(monitor.state.advanced);
+    const uint32_t then = input.period;
+    for (int k = 0; k < RATE_HZ; k++) {
+        step(98.0, 98.0, 0.0);
+    }
+    input.period = then;
+    step(98.0, 98.0, 0.0);
+    EXPECT_FALSE(suspects(1));
+    EXPECT_FALSE(monitor.state.advanced);
+}
+
 } // namespace

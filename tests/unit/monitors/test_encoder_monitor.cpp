@@ -164,4 +164,47 @@ TEST_F(EncoderMonitor, a_jump_that_the_observer_follows_to_any_speed_is_no_over_
     }
 }
 
+TEST_F(EncoderMonitor,
+       an_encoder_that_has_turned_round_is_suspect_for_a_quarter_of_a_second_each_time_and_never_again) {
+    double angle_deg = 0.0, speed_deg_s = 1800.0;
+    const auto run = [&](uint32_t periods) {
+        uint32_t suspect = 0;
+        for (uint32_t k = 0; k < periods; k++) {
+            angle_deg = std::fmod(angle_deg + speed_deg_s / RATE_HZ + 360.0, 360.0);
+            step(angle_deg);
+            suspect += monitor.turned_round;
+        }
+        return suspect;
+    };
+    run(RATE_HZ / 100);
+    for (int turn = 0; turn < 3; turn++) {
+        speed_deg_s = -speed_deg_s;
+        EXPECT_NEAR(run(RATE_HZ), RATE_HZ / 4, 1) << turn;
+    }
+    // The number of the period comes round: that of the last turn round, with the direction before it, is a new one.
+    speed_deg_s = 0.0;
+    EXPECT_EQ(run(RATE_HZ / 100), 0u);
+    input.periods = monitor.reversed_at - RATE_HZ / 1000;
+    residual.lost = true;
+    run(1);
+    residual.lost = false;
+    speed_deg_s = 1800.0;
+    EXPECT_EQ(run(RATE_HZ / 10), 0u);
+}
+
+TEST_F(EncoderMonitor, a_rotor_that_turns_the_other_way_after_a_rest_is_no_encoder_that_turns_round) {
+    double angle_deg = 100.0;
+    const auto turn = [&](double deg_s, uint32_t periods) {
+        for (uint32_t k = 0; k < periods; k++) {
+            step(angle_deg += deg_s / RATE_HZ);
+        }
+    };
+    turn(1800.0, RATE_HZ / 100);
+    turn(0.0, RATE_HZ / 100);
+    input.periods = monitor.turned_at; // a round of the numbers of periods later
+    turn(0.0, 1);
+    turn(-1800.0, RATE_HZ / 100);
+    EXPECT_FALSE(monitor.turned_round);
+}
+
 } // namespace

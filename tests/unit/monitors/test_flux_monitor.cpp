@@ -109,4 +109,72 @@ TEST(FluxMonitor, a_current_that_one_phase_lacks_and_another_has_is_a_sensor_s) 
     EXPECT_EQ(flux_monitor_verdict(&evidence, 2), FAULT_CURRENT_SENSOR);
 }
 
+// What a run leaves in the monitor, and samples in which the drive is at rest.
+class FluxMonitorState : public testing::Test {
+  protected:
+    uint32_t step(bool run) {
+        flux_sample_t sample{};
+        sample.run = run;
+        sample.periods = ++period;
+        sample.periods_per_ms = 40;
+        sample.period_flux_q29 = 1 << 20;
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            sample.off[phase] = true;
+        }
+        return flux_monitor_step(&parameters, &monitor, &sample);
+    }
+
+    flux_monitor_parameters_t parameters = {.angle = {.rate_hz = 40000}, .encoder = {.rate_hz = 40000}, .least_q8 = 0};
+    flux_monitor_t monitor{};
+    uint32_t period = 0;
+};
+
+TEST_F(FluxMonitorState, a_check_that_has_failed_in_a_run_remains_failed_until_the_run_ends) {
+    step(true);
+    monitor.balance.unbalanced = 2u;
+    const uint32_t failed = uint32_t(FAULT_BIT(FAULT_CURRENT_SENSOR));
+    EXPECT_EQ(step(true), failed);
+    monitor.balance.unbalanced = 0;
+    EXPECT_EQ(step(true), failed);
+    EXPECT_EQ(step(false), 0u);
+    EXPECT_EQ(step(true), 0u);
+}
+
+TEST_F(FluxMonitorState, a_phase_that_has_been_accepted_as_lost_leaves_no_failed_check) {
+    step(true);
+    monitor.balance.unbalanced = 2u;
+    ASSERT_NE(step(true), 0u);
+    flux_monitor_forget(&monitor);
+    EXPECT_EQ(monitor.failed, 0u) << "until the next sample, too";
+    EXPECT_EQ(step(true), 0u);
+}
+
+TEST_F(FluxMonitorState, what_has_begun_in_a_phase_before_it_was_accepted_as_lost_does_not_end_in_a_fault) {
+    step(true);
+    const phase_evidence_phase_t begun = {.excess_periods = 20, .turned = 1 << 26, .open_samples = 1};
+    monitor.phases_by_current.phase[1] = begun;
+    monitor.phases_by_current.doubted = 2u;
+    flux_monitor_forget(&monitor);
+    EXPECT_EQ(step(true), 0u) << "an excess that lasted half a millisecond when it ended would be a fault";
+    EXPECT_EQ(monitor.phases_by_current.doubted, 0u);
+    for (const phase_evidence_phase_t &phase : monitor.phases_by_current.phase) {
+        EXPECT_EQ(phase.excess_periods, 0u);
+        EXPECT_EQ(phase.open_samples, 0u);
+        EXPECT_EQ(phase.turned, 0);
+    }
+}
+
+TEST_F(FluxMonitorState, phases_with_evidence_of_a_fault_are_those_of_this_run_or_the_last) {
+    step(true);
+    monitor.balance.unbalanced = 2u;
+    step(true);
+    monitor.balance.unbalanced = 0;
+    EXPECT_EQ(monitor.phases, 2u);
+    step(true);
+    step(false);
+    EXPECT_EQ(monitor.phases, 2u) << "for the record, after the run";
+    step(true);
+    EXPECT_EQ(monitor.phases, 0u);
+}
+
 } // namespace

@@ -29,7 +29,7 @@ class PhaseBalance : public testing::Test {
 
     // Eight electrical revolutions in each of which the phases conduct for a third, one after another.
     uint32_t window(uint32_t periods = PERIODS_PER_REVOLUTION) {
-        residual.step = int32_t((int64_t(1) << 32) / periods) + 1;
+        residual.step = direction * (int32_t((int64_t(1) << 32) / periods) + 1);
         flux_evidence_t evidence{};
         for (uint32_t k = 0; k < 8 * periods; k++) {
             for (unsigned phase = 0; phase < residual.phases; phase++) {
@@ -37,8 +37,8 @@ class PhaseBalance : public testing::Test {
                 flux_residual_phase_t &one = residual.phase[phase];
                 one.known = conducts && (phase != brief || k % periods % 16 == 0);
                 one.current_q9 = 20 * 512;
-                one.table_q29 = TABLE_Q29;
-                one.voltage_q29 = int32_t(TABLE_Q29 * ratio[phase]);
+                one.table_q29 = table_q29;
+                one.voltage_q29 = int32_t(table_q29 * ratio[phase]);
             }
             evidence = {};
             phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, &evidence);
@@ -50,6 +50,7 @@ class PhaseBalance : public testing::Test {
     flux_residual_t residual{};
     unsigned silent = HAL_PHASES_MAX; // phase without current
     unsigned brief = HAL_PHASES_MAX;  // phase that conducts for a sixteenth of its third
+    int32_t direction = 1, table_q29 = TABLE_Q29;
     double ratio[HAL_PHASES_MAX] = {1.0, 1.0, 1.0, 1.0};
 };
 
@@ -155,6 +156,19 @@ TEST_F(PhaseBalance, a_failed_check_remains_until_the_end_of_the_run) {
     flux_evidence_t evidence{};
     phase_balance_step(&balance, &residual, PHASE_BALANCE_LEAST_Q8, &evidence);
     EXPECT_EQ(verdict(evidence), 0u);
+}
+
+TEST_F(PhaseBalance, a_rotor_that_turns_backwards_is_judged_as_one_that_turns_forwards) {
+    direction = -1;
+    ratio[1] = 1.36;
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+}
+
+TEST_F(PhaseBalance, a_ratio_beyond_256_is_too_large_and_not_a_small_one) {
+    table_q29 = 1 << 16; // the voltage may exceed it by far
+    ratio[1] = 257.0;    // 1 modulo 256
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
+    EXPECT_EQ(balance.unbalanced, 2u);
 }
 
 } // namespace

@@ -211,4 +211,17 @@ TEST_F(Stall, extremes_saturate) {
     EXPECT_EQ(time_to_fault_us(), 0u);
 }
 
+TEST_F(Stall, rotor_that_stands_without_much_torque_is_not_stalled_when_the_clock_comes_round) {
+    input.torque_reference_q24 = 5 * NM;
+    stall_monitor_t monitor = {};
+    input.speed_q22 = -RAD_S;
+    stall_monitor_failed(&monitor, &input, START_US);
+    input.speed_q22 = 0;
+    constexpr uint32_t STEP_US = 20000;
+    for (uint64_t us = 0; us < uint64_t{2} << 32; us += STEP_US) {
+        const bool failed = stall_monitor_failed(&monitor, &input, uint32_t(START_US + us));
+        ASSERT_FALSE(failed && us > 1000000) << us;
+    }
+}
+
 } // namespace

@@ -289,6 +289,46 @@ TEST_F(NvmStore, a_word_that_cannot_be_programmed_is_passed_over) {
     EXPECT_TRUE(has_set(&drive, 1));
 }
 
+TEST_F(NvmStore, failures_that_one_record_has_survived_do_not_count_for_the_next) {
+    for (unsigned save = 1; save <= 3 * SETS_PER_PAGE; save++) {
+        memory.hal.erase_errors = NVM_RING_ATTEMPTS - 1;
+        parameter_store_save(&drive.store);
+        while (drive.store.saving == NVM_STORE_SAVING) {
+            nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+        }
+        ASSERT_EQ(drive.store.saving, NVM_STORE_SAVED) << save;
+        ASSERT_EQ(drive.store.parameters.sequence, save);
+    }
+}
+
+TEST_F(NvmStore, a_word_that_the_memory_only_says_to_have_programmed_is_read_back_and_passed_over) {
+    write(WRITE_SET);
+    for (unsigned word = 0; word < SET_WORDS; word++) {
+        memory_t copy = memory;
+        copy.hal.deaf_word = &copy.hal.nvm.word[PARAMETER_PAGE][SET_WORDS + word];
+        write_next(&drive, &copy, WRITE_SET, 0, NVM_CUT_OLD);
+        EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED) << word;
+        start_drive(&drive, &copy);
+        EXPECT_TRUE(has_set(&drive, 1 + copy.sets)) << word << ": what is said to be stored is there";
+    }
+}
+
+TEST_F(NvmStore, a_set_whose_commit_word_is_torn_is_loaded_and_stored_once_more_at_the_start) {
+    write(WRITE_SET);
+    *set_word(0, SET_WORDS - 1) ^= 1;
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(has_set(&drive, 1));
+    for (unsigned i = 0; i < SET_WORDS; i++) {
+        EXPECT_EQ(drive.store.saving, NVM_STORE_SAVING);
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+    }
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
+    *set_word(0, SET_WORDS - 1) = HAL_NVM_ERASED; // next time the torn word reads as none
+    start_drive(&drive, &memory);
+    EXPECT_TRUE(has_set(&drive, 1));
+    EXPECT_NE(drive.store.saving, NVM_STORE_SAVING) << "the commit word of this one is whole";
+}
+
 // What a power cut at the present instant leaves.
 bool starts_with_set(const memory_t &memory, uint32_t set) {
     static memory_t copy;
