@@ -1,6 +1,7 @@
 /* The local bus: an AF_UNIX SOCK_SEQPACKET socket, one record per frame: virtual time in ns (8 bytes, little endian; 0
  * from clients), then struct can_frame or struct canfd_frame. Records of any other size, or with an impossible length
- * or identifier, are ignored and counted. An empty record ends the connection, as closing it does.
+ * or identifier, are ignored and counted. An empty record ends the connection, as closing it does. The socket has mode
+ * 0600: who may read and write it commands the drive.
  */
 #define _GNU_SOURCE /* accept4, sendmmsg */
 
@@ -349,6 +350,14 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
     return true;
 }
 
+/* Binds a socket whose file only its owner can connect to, whatever the umask: its mode is that of the descriptor,
+ * which leaves no moment in which it is another one; the umask, of the whole process, could only take bits from it. */
+static bool bind_private(int listener, const struct sockaddr_un *address) {
+    return fchmod(listener, S_IRUSR | S_IWUSR) == 0 &&
+           bind(listener, (const struct sockaddr *)address, sizeof *address) == 0 &&
+           chmod(address->sun_path, S_IRUSR | S_IWUSR) == 0;
+}
+
 transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_SIZE]) {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     if (strlen(path) >= sizeof address.sun_path) {
@@ -362,8 +371,8 @@ transport_t *transport_local_open(const char *path, char error[TRANSPORT_ERROR_S
     }
     int listener = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     struct stat status;
-    if (listener < 0 || bind(listener, (struct sockaddr *)&address, sizeof address) != 0 ||
-        listen(listener, CLIENTS_MAX) != 0 || lstat(path, &status) != 0) {
+    if (listener < 0 || !bind_private(listener, &address) || listen(listener, CLIENTS_MAX) != 0 ||
+        lstat(path, &status) != 0) {
         snprintf(error, TRANSPORT_ERROR_SIZE, "--can unix:%s: %s", path, strerror(errno));
         if (listener >= 0) {
             close(listener);

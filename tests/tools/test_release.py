@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 import zipfile
@@ -37,8 +38,19 @@ def test_permissions_are_the_least_and_the_publishing_job_runs_no_code_of_the_re
     assert publish["needs"] == "build" and all("run" not in step for step in publish["steps"])
     assert [step["uses"].split("@")[0] for step in publish["steps"]] == [
         "actions/download-artifact", "pypa/gh-action-pypi-publish"]
-    uses = [step["uses"] for job in JOBS.values() for step in job["steps"] if "uses" in step]
-    assert all(use.partition("@")[2] for use in uses) and "secrets" not in str(WORKFLOW)
+    assert "secrets" not in str(WORKFLOW)
+
+
+def test_every_action_of_every_workflow_is_a_commit_whose_version_is_said():
+    """Who owns an action may move its tags."""
+    workflows = [path for folder in (ROOT, ROOT / "tests/tools/foreign")
+                 for path in sorted((folder / ".github/workflows").glob("*.yml"))]
+    assert len(workflows) == 3
+    for path in workflows:
+        uses = re.findall(r"uses: *(.*)", path.read_text(encoding="utf-8"))
+        assert uses, path
+        for use in uses:
+            assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+", use), f"{path}: {use}"
 
 
 def test_its_commands_exist_and_publish_the_folder_that_the_wheel_is_written_to():

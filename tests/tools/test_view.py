@@ -5,12 +5,17 @@ Time is virtual: the drive waits until the page has shown what has come so far.
 
 from __future__ import annotations
 
+import functools
+import http.client
 import http.server
 import json
 import math
 import random
+import subprocess
+import sys
 import threading
 from collections import Counter
+from contextlib import ExitStack
 from itertools import pairwise
 
 import can
@@ -18,7 +23,7 @@ import numpy as np
 import pytest
 from cantools.database.errors import DecodeError
 from visitor import STEP_S, Visitor, nothing_is_cut_off, picture
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
 from salient.bench import failure
@@ -33,6 +38,7 @@ from salient.view.command import LogFeed
 from salient.view.commands import COMMANDS
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
+from salient.view.server import PAGES_MAX
 
 TWENTY = [
     *(f"DRIVE_STATUS.{name}" for name in ("time_us", "state", "fault", "voltage_saturated", "single_pulse", "cycle")),
@@ -65,6 +71,22 @@ def live(browser, make_bench, serve):
     for visitor in visitors:
         visitor.page.close()
         assert visitor.errors == []
+
+
+@pytest.fixture
+def no_feed(tmp_path):
+    """The link of a server that has nothing to show, and a function that gives what it has written as errors."""
+    log, program = tmp_path / "errors", (
+        "from types import SimpleNamespace\n"
+        "from salient.view.frames import FrameStore\n"
+        "from salient.view.server import Server\n"
+        "server = Server(SimpleNamespace(info={}, store=FrameStore(), link=None, ended='', first_number=lambda: 0))\n"
+        "print(server.link, flush=True)\n"
+        "server.run()\n")
+    with log.open("wb") as errors, subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE,
+                                                    stderr=errors, text=True) as process:
+        yield process.stdout.readline().strip(), lambda: log.read_text(encoding="utf-8")
+        process.terminate()
 
 
 def frames_by_message(bench):
@@ -398,6 +420,38 @@ def test_a_page_of_another_origin_can_neither_command_nor_read_even_with_the_tok
         page.close()
         server.shutdown()
     assert result == ["refused", "refused"]
+
+
+@pytest.mark.parametrize(("path", "status"), [
+    ("/main.js", 200), ("/look.css", 200), ("/%00", 404), ("/main.js%00", 404), ("/..%2fserver.py", 404),
+    ("//etc/passwd", 404), ("/vendor", 404), (f"/{'x' * 300}", 404), (f"/{'x' * 5000}", 404), (f"/{'a/' * 3000}b", 404),
+    ("/%ff%fe", 404)])
+def test_a_path_that_is_no_file_of_the_page_is_not_found_and_leaves_no_traceback(no_feed, path, status):
+    link, errors = no_feed
+    connection = http.client.HTTPConnection(_origin(link).removeprefix("http://"))
+    connection.request("GET", path)
+    assert connection.getresponse().status == status
+    connection.close()
+    assert errors() == ""
+
+
+def test_more_pages_than_are_served_at_once_are_refused_with_the_reason_until_one_is_closed(no_feed):
+    link, errors = no_feed
+    open_page = functools.partial(connect, _address(link), origin=_origin(link), proxy=None)
+    with ExitStack() as stack:
+        pages = [stack.enter_context(open_page()) for _ in range(PAGES_MAX)]
+        for page in pages:
+            assert "info" in json.loads(page.recv())
+        for _ in range(2):
+            with open_page() as refused, pytest.raises(ConnectionClosedError) as closed:
+                refused.recv()
+            told = closed.value.rcvd
+            assert (told.code, told.reason) == (1013, f"{PAGES_MAX} pages are open, and there are no more than that: "
+                                                      "close one")
+        pages.pop().close()
+        with open_page() as accepted:
+            assert "info" in json.loads(accepted.recv())
+    assert errors() == ""
 
 
 MALFORMED = [

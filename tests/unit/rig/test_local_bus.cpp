@@ -33,6 +33,24 @@ TEST(LocalBus, InvalidAddressIsNamedInOneLine) {
     }
 }
 
+TEST(LocalBus, OnlyItsOwnerCanConnectWhateverTheUmask) {
+    for (const mode_t mask : {0u, 022u, 077u, 0777u}) {
+        const mode_t before = umask(mask);
+        char folder[] = "/tmp/rig_bench_XXXXXX";
+        const std::string path = std::string(mkdtemp(folder)) + "/bus";
+        chmod(folder, 0700);
+        char error[TRANSPORT_ERROR_SIZE] = "";
+        transport_t *transport = transport_local_open(path.c_str(), error);
+        umask(before);
+        ASSERT_NE(transport, nullptr) << error;
+        struct stat status;
+        ASSERT_EQ(lstat(path.c_str(), &status), 0);
+        EXPECT_EQ(status.st_mode, S_IFSOCK | 0600u) << std::oct << mask;
+        transport_close(transport);
+        std::filesystem::remove_all(folder);
+    }
+}
+
 TEST(LocalBus, SocketInUseIsRejectedAndLeftUntouched) {
     RigBench bench;
     EXPECT_NE(open_error("unix:" + bench.path).find("in use"), std::string::npos);

@@ -87,7 +87,9 @@ class Module:
 def serve(module: Module, path: str) -> None:
     """Serves the bus until standard input ends."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    os.fchmod(listener.fileno(), 0o600)  # of the file, too, as of transport_local.c
     listener.bind(path)
+    Path(path).chmod(0o600)  # what the umask has taken away
     listener.listen()
     print(json.dumps({"ready": True, "can": f"unix:{path}", "pid": os.getpid()}), flush=True)
     client: socket.socket | None = None

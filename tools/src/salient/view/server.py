@@ -33,6 +33,9 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 _TEXT_BYTES_MAX = 65_536
+PAGES_MAX = 32
+_TOO_MANY = f"{PAGES_MAX} pages are open, and there are no more than that: close one"
+_TRY_LATER = 1013  # of RFC 6455's registry
 _POLL_S = 0.004
 _LOG_REFUSES = "a log takes no commands"
 
@@ -72,6 +75,8 @@ class Server:
         self.feed = feed
         self.token = secrets.token_urlsafe(18)
         self.malformed = 0
+        self._files = {path.relative_to(PAGE).as_posix(): path for path in PAGE.rglob("*") if path.suffix in _TYPES}
+        self._files[LOOK.name] = LOOK
         self._commander = Commander(feed.link) if feed.link else None
         self._leaseholder: _Page | None = None
         self._pages: list[_Page] = []
@@ -106,11 +111,10 @@ class Server:
         return FileResponse(PAGE / "index.html", headers=_HEADERS)
 
     async def _file(self, request: Request) -> Response:
-        name = request.path_params["path"]
-        path = LOOK if name == LOOK.name else (PAGE / name).resolve()
+        path = self._files.get(request.path_params["path"])  # no name of a request reaches the file system
         if request.headers.get("host") not in self._hosts():
             return PlainTextResponse("", 403, headers=_HEADERS)
-        if not (path == LOOK or path.is_relative_to(PAGE)) or not path.is_file() or path.suffix not in _TYPES:
+        if path is None:
             return PlainTextResponse("no such file", 404, headers=_HEADERS)
         return FileResponse(path, media_type=_TYPES[path.suffix], headers=_HEADERS)
 
@@ -125,13 +129,16 @@ class Server:
                 websocket.query_params):
             await websocket.close(1008)  # before it is accepted: an answer 403 without content
             return
-        await websocket.accept()
+        if len(self._pages) >= PAGES_MAX:
+            await websocket.accept()  # else the page would not be told why
+            await websocket.close(_TRY_LATER, _TOO_MANY)
+            return
         page = _Page(websocket, self.feed.first_number())
         self._pages.append(page)
-        tasks = [asyncio.create_task(task) for task in (self._send_frames(page), self._send_notices(page))]
+        tasks: list[asyncio.Task[None]] = []
         try:
-            await websocket.send_text(json.dumps({"info": self.feed.info}))
-            await self._take_messages(page)
+            await websocket.accept()
+            await self._attend(page, tasks)
         except (WebSocketDisconnect, RuntimeError):
             pass  # closed by the page, at any moment
         finally:
@@ -139,6 +146,11 @@ class Server:
                 task.cancel()
             self._pages.remove(page)
             self._release(page)
+
+    async def _attend(self, page: _Page, tasks: list[asyncio.Task[None]]) -> None:
+        tasks += [asyncio.create_task(task) for task in (self._send_frames(page), self._send_notices(page))]
+        await page.websocket.send_text(json.dumps({"info": self.feed.info}))
+        await self._take_messages(page)
 
     async def _take_messages(self, page: _Page) -> None:
         while True:

@@ -34,9 +34,11 @@ export class LiveSource {
                     this.takeBinary(event.data);
                 }
             };
-            socket.onclose = () => {
-                reject(new Error("The server refused this page or is not there: open the link that it has printed."));
-                this.takeNotice({ ended: true, lease: "free", text: "The connection to the server has ended." });
+            socket.onclose = (event) => {
+                const refused = "The server refused this page or is not there: open the link that it has printed.";
+                reject(new Error(event.reason || refused));
+                const ended = event.reason || "The connection to the server has ended.";
+                this.takeNotice({ ended: true, lease: "free", text: ended });
                 this.answers.forEach((answer) => answer({ ok: false, message: "the connection has ended" }));
             };
             this.socket = socket;
