@@ -98,24 +98,27 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _log(options: argparse.Namespace) -> int:
+    from salient.bus.databases import load_databases
+
+    others = load_databases(options.dbc, options.node)
     if options.convert:
         from salient.bus.log_reader import convert
 
         if options.duration_s is not None:
             raise UsageError("--duration-s: not with --convert, which reads the whole file")
-        count, place = convert(options.convert, options.out, options.machine, options.node, options.rotate)
+        count, place = convert(options.convert, options.out, options.machine, options.node, options.rotate,
+                               others)
         print(f"{count} frames: {place}")
         return 0
     from salient.bus.monitor import record
 
-    return record(options.can, options.out, options.duration_s, options.machine, options.node, options.rotate)
+    return record(options.can, options.out, options.duration_s, options.machine, options.node, options.rotate, others)
 
 
 def _monitor(options: argparse.Namespace) -> int:
     from salient.bus.monitor import monitor
 
-    return monitor(options.can, options.every_s, options.duration_s, options.machine, options.signals, options.node,
-                   options.replay)
+    return monitor(options)
 
 
 def _command(options: argparse.Namespace) -> int:

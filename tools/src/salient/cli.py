@@ -122,6 +122,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     log.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
     _add_machine(log, "whose signals are decoded: ")
     _add_node(log)
+    _add_databases(log, "whose signals are decoded, too, where --out has decoded signals")
 
     monitor = command("monitor", "watch a running drive, or a log, one line of values per period")
     watched = monitor.add_mutually_exclusive_group()
@@ -131,10 +132,15 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                          help="period in virtual time (default 0.1)")
     monitor.add_argument("--duration-s", type=_positive, metavar="X", help="virtual time after which it ends")
     monitor.add_argument("--signals", nargs="+", metavar="NAME",
-                         help="these signals of drive and test bench: MESSAGE.SIGNAL, or SIGNAL where only one message "
-                         "has it")
+                         help="these signals of drive, test bench and --dbc: MESSAGE.SIGNAL, or SIGNAL where only one "
+                         "message has it, or MESSAGE for all of it")
+    monitor.add_argument("--bus", action="store_true",
+                         help="the traffic instead: load, cycle times beside the expected ones, missing and unknown "
+                         "messages, by node, as a table per period")
     _add_machine(monitor)
     _add_node(monitor)
+    _add_databases(monitor, "whose signals can be named, and whose messages are watched")
+    _add_bit_rates(monitor)
 
     commands_from_shell = command("command", "command a running drive and its test bench from a shell")
     actions = commands_from_shell.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
@@ -164,6 +170,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                        help="instead: a log, as log --convert reads it, or the folder of a failed test")
     _add_machine(view, "whose poles and signals are shown: ")
     _add_node(view)
+    _add_databases(view, "whose signals are shown, too")
+    _add_bit_rates(view)
     view.set_defaults(node=None)  # a failed test has noted them
 
     tab = command("tab", "the live page with a drive inside, as one file for a browser: no installation, no server")
@@ -291,6 +299,20 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
                         help=f"node number of the drive: {low} to {high} (default {DEFAULTS['node']})")
 
 
+def _add_databases(parser: argparse.ArgumentParser, purpose: str) -> None:
+    parser.add_argument("--dbc", action="append", type=Path, default=[], metavar="FILE.dbc",
+                        help=f"database of other nodes of the bus, {purpose}; may be repeated")
+
+
+def _add_bit_rates(parser: argparse.ArgumentParser) -> None:
+    option = OPTIONS["bit_rate"]
+    parser.add_argument("--bit-rate", type=_option_type("bit_rate"), default=DEFAULTS["bit_rate"], metavar="N",
+                        help=f"of the bus in bit/s, for its load: {option.allowed} (default {DEFAULTS['bit_rate']})")
+    parser.add_argument("--data-bit-rate", type=_data_bit_rate, metavar="N",
+                        help="of the data of flexible data rate frames that switch it: a whole number from 10000 to "
+                        "20000000 (default that of --bit-rate)")
+
+
 def _add_can(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--can", type=lambda text: text if text == "auto" else _convert("can", text), default="auto",
                         metavar="BUS", help=f"{BUSES}, or auto (default): vcan0 when it is up, else "
@@ -388,6 +410,12 @@ def _one_of(allowed: Iterable[str]) -> Callable[[str], str]:
 def _count(text: str) -> int:
     if not re.fullmatch("[0-9]{1,4}", text) or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 1024")
+    return int(text)
+
+
+def _data_bit_rate(text: str) -> int:
+    if not re.fullmatch("[0-9]{1,8}", text) or not 10_000 <= int(text) <= 20_000_000:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 10000 to 20000000")
     return int(text)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import can
@@ -10,32 +11,30 @@ from cantools.database.can import Database
 
 from salient.bus.file_log import FileLog
 from salient.bus.identity import Carrier, OtherDatabase
-from salient.bus.signals import SignalTable, drive_database, rig_database
-
-FRAME_BYTES = 16
-"""Memory of a frame that waits."""
+from salient.bus.signals import BusSignals, SignalTable, drive_database, rig_database
 
 
 class DecodedLog(FileLog):
-    """Frames that the DBCs of drive and test bench do not define are left out: other identifiers and lengths, remote,
-    error and flexible data rate frames.
+    """Frames that no database defines are left out: other identifiers and lengths, remote and error frames, and of
+    drive and test bench those of a flexible data rate. others: databases of other nodes (load_databases).
 
     write raises OtherDatabase, as Carrier does: with the first report of another machine than the one that is stated,
     or of an unknown one, and then there is no file; or when the drive becomes another one, and the file ends there.
     """
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str, others: Sequence[Database] = ()) -> None:
         super().__init__(path)
+        self._others = tuple(others)
         self._carrier, self._node, self._source = carrier, node, source
         self._tables = self._new_tables()
         self._refused = self._closed = False
 
-    def _databases(self, machine: str | None) -> tuple[Database, Database]:
-        return drive_database(machine, self._node), rig_database(self._node)
+    def _databases(self, machine: str | None) -> tuple[Database, ...]:
+        return drive_database(machine, self._node), rig_database(self._node), *self._others
 
-    def _new_tables(self) -> tuple[SignalTable, SignalTable]:
-        drive, rig = self._databases(None)
-        return SignalTable(drive), SignalTable(rig)
+    def _new_tables(self) -> tuple[SignalTable, ...]:
+        drive, rig, *others = self._databases(None)
+        return SignalTable(drive), SignalTable(rig), *map(BusSignals, others)
 
     def _take(self, time_ns: int, message: can.Message) -> bool:
         """Keeps a frame; True once the machine is known. OtherDatabase."""
@@ -53,7 +52,12 @@ class DecodedLog(FileLog):
     @property
     def _waiting(self) -> int:
         """Frames that are kept."""
-        return sum(map(SignalTable.frames, self._tables))
+        return sum([table.frames for table in self._tables])
+
+    @property
+    def _waiting_bytes(self) -> int:
+        """Their memory."""
+        return sum([table.memory_bytes for table in self._tables])
 
     def close(self) -> None:
         if self._closed:

@@ -4,13 +4,14 @@ be compared; microseconds), and decoded signals instead of frames: MF4, CSV and 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import can
 from can.io import ASCWriter, BLFWriter, blf
 from can.util import len2dlc
+from cantools.database.can import Database
 
 from salient.bus.file_log import FileLog, Log
 from salient.bus.identity import Carrier
@@ -231,17 +232,17 @@ class RotatingLog:
 
 
 def open_log(path: Path, machine: str | None = None, node: int = 0, source: str = "",
-             rotation: Rotation | None = None) -> Log:
+             rotation: Rotation | None = None, others: Sequence[Database] = ()) -> Log:
     """A log by its suffix. machine, node: those whose DBC decodes the frames of MF4, CSV and Parquet, by default the
-    machine that the drive reports. source: of the frames, for messages. rotation: see RotatingLog. UsageError: the
-    suffix is not one of LOG_SUFFIXES, or the file cannot be made."""
+    machine that the drive reports; others: databases of other nodes, likewise. source: of the frames, for messages.
+    rotation: see RotatingLog. UsageError: the suffix is not one of LOG_SUFFIXES, or the file cannot be made."""
     if path.suffix not in LOG_SUFFIXES:
         raise UsageError(f"--out {path}: the suffix must be {either(LOG_SUFFIXES)}")
     carrier = Carrier(source or str(path), machine, node) if path.suffix in DECODED_SUFFIXES else None
 
     def make(file: Path) -> Log:
         if carrier is not None:
-            return _decoded_log(file, carrier, node, source or str(path))
+            return _decoded_log(file, carrier, node, source or str(path), others)
         formats: dict[str, Callable[[Path], Log]] = {".blf": BlfLog, ".asc": AscLog, ".log": CandumpLog}
         return formats[path.suffix](file)
 
@@ -251,14 +252,14 @@ def open_log(path: Path, machine: str | None = None, node: int = 0, source: str 
         raise UsageError(f"--out {path}: {error.strerror}") from None
 
 
-def _decoded_log(path: Path, carrier: Carrier, node: int, source: str) -> Log:
+def _decoded_log(path: Path, carrier: Carrier, node: int, source: str, others: Sequence[Database]) -> Log:
     if path.suffix == ".mf4":
         from salient.bus.mf4 import Mf4Log  # asammdf loads pandas: a second that only this format needs
 
-        return Mf4Log(path, carrier, node, source)
+        return Mf4Log(path, carrier, node, source, others)
     from salient.bus.signal_tables import CsvLog, ParquetLog
 
-    return (CsvLog if path.suffix == ".csv" else ParquetLog)(path, carrier, node, source)
+    return (CsvLog if path.suffix == ".csv" else ParquetLog)(path, carrier, node, source, others)
 
 
 def write_logs(frames: Iterable[tuple[int, can.Message]], *paths: Path) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import can
+from cantools.database.can import Database
 
 from salient.bus.blf_reader import read_blf
-from salient.bus.clock import has_plain_data, nodes_of_messages
+from salient.bus.clock import nodes_of_messages
+from salient.bus.databases import messages_of
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_input import Damage, LogInput
 from salient.bus.text_logs import Frames, nanoseconds, read_text
@@ -26,14 +28,17 @@ class LogDamaged(RunFailed):
 
 
 class NoKnownFrame(RunFailed):
-    """A log has no frame of a drive or its test bench."""
+    """A log has no frame of a drive, its test bench or another node with a database."""
 
 
 class KnownFrames:
-    """Whether the frames of a log are those of a drive or its test bench, with a node number or any (None)."""
+    """Whether the frames of a log are those of a drive or its test bench, with a node number or any (None), or of other
+    nodes, by their databases."""
 
-    def __init__(self, node: int | None) -> None:
+    def __init__(self, node: int | None, others: Sequence[Database] = ()) -> None:
         self._node = node
+        self._lengths = {(message.frame_id, message.is_extended_frame): message.length for message in
+                         messages_of(others)}
         self._others: set[int] = set()
         self._count = 0
         self.found = False
@@ -41,7 +46,11 @@ class KnownFrames:
     def add(self, message: can.Message) -> None:
         """Takes a frame."""
         self._count += 1
-        if self.found or not has_plain_data(message):
+        if self.found or message.is_error_frame or message.is_remote_frame:
+            return
+        length = self._lengths.get((message.arbitration_id, message.is_extended_id))
+        self.found = length is not None and length <= len(message.data)
+        if self.found or message.is_fd:
             return
         key = (message.arbitration_id, message.is_extended_id, len(message.data))
         nodes = nodes_of_messages().get(key, frozenset())
@@ -54,14 +63,15 @@ class KnownFrames:
         if self.found:
             return
         node = "" if self._node is None else f" with node number {self._node} (--node)"
+        files = " or of the messages of --dbc" if self._lengths else ""
         others = f", but of node {' and '.join(map(str, sorted(self._others)))}" if self._others else ""
-        raise NoKnownFrame(f"{where}: none of {self._count} frames is of a drive{node}{others}{end}")
+        raise NoKnownFrame(f"{where}: none of {self._count} frames is of a drive{node}{files}{others}{end}")
 
 
-def convert(source: Path, target: Path, machine: str | None, node: int = 0, rotation: Rotation | None = None
-            ) -> tuple[int, str]:
+def convert(source: Path, target: Path, machine: str | None, node: int = 0, rotation: Rotation | None = None,
+            others: Sequence[Database] = ()) -> tuple[int, str]:
     """Writes the frames of a log to another, whose suffix is the format; returns their number and the place.
-    rotation: see open_log.
+    rotation, others: see open_log.
 
     UsageError: a file cannot be read or written; OtherDatabase: see Carrier; then there is no target. LogDamaged: see
     read_log; the target has the frames before. NoKnownFrame: there is none of a drive, and of a format with decoded
@@ -78,8 +88,8 @@ def convert(source: Path, target: Path, machine: str | None, node: int = 0, rota
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
     decodes = target.suffix in DECODED_SUFFIXES
-    known = KnownFrames(node if decodes else None)
-    log = open_log(target, machine, node, str(source), rotation)
+    known = KnownFrames(node if decodes else None, others)
+    log = open_log(target, machine, node, str(source), rotation, others)
     count, damage = 0, ""
     try:
         try:

@@ -1,4 +1,4 @@
-"""MF4 files: the signals of both DBCs over virtual time, with units, names of states and comments.
+"""MF4 files: the signals of the databases over virtual time, with units, names of states and comments.
 
 A message is a channel group of its name; the signals that a multiplexer selects are groups of their own, because each
 has only the frames that carry it.
@@ -6,7 +6,7 @@ has only the frames that carry it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
@@ -14,10 +14,11 @@ from typing import Any
 
 import can
 import numpy as np
+from cantools.database.can import Database, Signal
 
-from salient.bus.decoded_log import FRAME_BYTES, DecodedLog
+from salient.bus.decoded_log import DecodedLog
 from salient.bus.identity import Carrier, hash_of
-from salient.bus.signals import SignalTable
+from salient.bus.signals import SignalTable, is_enumeration
 from salient.errors import optional_package
 
 _DEFLATE = 1
@@ -31,8 +32,8 @@ class Mf4Log(DecodedLog):
     """An MF4 file, written when it is closed; until then 16 bytes of memory for each frame. Its comment names the
     machine."""
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
-        super().__init__(path, carrier, node, source)
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str, others: Sequence[Database] = ()) -> None:
+        super().__init__(path, carrier, node, source, others)
         asammdf = optional_package("asammdf", f"--out {path}: MF4")
         self._mdf: Any = asammdf.MDF(version="4.10")
         self._signal = asammdf.Signal
@@ -46,7 +47,7 @@ class Mf4Log(DecodedLog):
 
     @property
     def size(self) -> int:
-        return FRAME_BYTES * self._waiting
+        return self._waiting_bytes
 
     def _write_kept(self) -> None:
         self._mdf.header.start_time = datetime.fromtimestamp((self._start_ns or 0) // _S_NS, UTC)
@@ -64,8 +65,8 @@ class Mf4Log(DecodedLog):
         for database, table in zip(self._databases(machine), self._tables, strict=True):
             table.decode_with(database)
             for message in sorted(database.messages, key=lambda m: m.frame_id):
-                by_selector = sorted(message.signals, key=lambda signal: signal.multiplexer_ids or [])
-                for _, signals in groupby(by_selector, key=lambda signal: signal.multiplexer_ids):
+                by_selector = sorted(message.signals, key=_selection)
+                for _, signals in groupby(by_selector, key=_selection):
                     channels = [self._channel(table, message.name, signal) for signal in signals]
                     if len(channels[0]):
                         yield message.name, message.comment or "", channels
@@ -73,10 +74,16 @@ class Mf4Log(DecodedLog):
     def _channel(self, table: SignalTable, message: str, definition: Any) -> Any:
         signal = table[f"{message}.{definition.name}"]
         conversion: dict[str, object] | None = None
-        if signal.choices:
+        samples = signal.value
+        if signal.choices and is_enumeration(definition):
             conversion = {"default": b""}
             for index, (number, text) in enumerate(signal.choices.items()):
-                conversion |= {f"val_{index}": number, f"text_{index}": text.encode()}
-        samples = signal.value.astype(np.int64) if signal.choices else signal.value
+                conversion |= {f"val_{index}": int(number), f"text_{index}": text.encode()}
+            samples = samples.astype(np.int64)
         return self._signal(samples, signal.time_s, unit=signal.unit, name=signal.name, conversion=conversion,
                             comment=definition.comment or "")
+
+
+def _selection(signal: Signal) -> tuple[str, list[int]]:
+    """What decides whether a frame carries a signal: multiplexer and its values."""
+    return signal.multiplexer_signal or "", signal.multiplexer_ids or []

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import can
 from cantools.database.can import Database
 
 from salient.bus.clock import VirtualTimeReader, has_plain_data, nodes_of_drives, open_bus
+from salient.bus.databases import load_databases, messages_of
+from salient.bus.frame_bits import BitRates
 from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
 from salient.bus.interface import closed_in_order
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_reader import read_log
 from salient.bus.selected_signals import SelectedSignals
 from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.bus.traffic import Traffic
+from salient.bus.traffic_text import event_line, load_text, report_lines
 from salient.config import Rotation
 from salient.errors import UsageError
 
@@ -34,6 +39,7 @@ _COLUMNS = (
 """Title, signal and number format, in the order of a line."""
 _WIDTH = 120
 """Characters of a line where the output is no terminal."""
+_LOOK_S = 0.02
 _ABSENT_S = 1.0
 """Without a frame of a drive, whose heartbeat comes every 100 ms, until that is told: virtual time, and where no frame
 moves it, as on an interface without any drive, wall time."""
@@ -44,9 +50,10 @@ class _BusClosed(Exception):
 
 
 def record(address: str, path: Path, duration_s: float | None, machine: str | None, node: int = 0,
-           rotation: Rotation | None = None) -> int:
+           rotation: Rotation | None = None, others: Sequence[Database] = ()) -> int:
     """Writes every frame on a bus to a log file, on virtual time. machine, node: of the drive whose signals an MF4 file
-    has, by default the machine that it reports. rotation: see RotatingLog.
+    has, by default the machine that it reports. rotation: see RotatingLog. others: databases of other nodes, whose
+    signals it has as well.
 
     Ends when `duration_s` of virtual time have passed, on an interrupt, or when the bus closes; the file is complete in
     every case. Returns the exit code: 1 when the bus closed early (see _report_closed) or an MF4 file has no frame of
@@ -57,12 +64,12 @@ def record(address: str, path: Path, duration_s: float | None, machine: str | No
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {path}: {error.strerror}") from None
-    log = open_log(path, machine, node, address, rotation)
+    log = open_log(path, machine, node, address, rotation, others)
     count, closed = 0, None
     # The formats with frames have those of all nodes.
-    nodes = _Nodes(address, node if path.suffix in DECODED_SUFFIXES else None)
+    nodes = _Nodes(address, node if path.suffix in DECODED_SUFFIXES else None, others)
     try:
-        for timed in nodes.watch(_frames(address, duration_s, "recording", nodes.tell_absence)):
+        for timed in nodes.watch(_frames(address, duration_s, "recording", nodes)):
             log.write(*timed)
             count += 1
     except KeyboardInterrupt:
@@ -75,51 +82,104 @@ def record(address: str, path: Path, duration_s: float | None, machine: str | No
     return _finish(address, duration_s, closed, nodes)
 
 
-def monitor(address: str, every_s: float, duration_s: float | None, machine: str | None,
-            signals: Sequence[str] | None = None, node: int = 0, replay: Path | None = None) -> int:
-    """Prints the named signals, else the main ones of the drive of a machine and node number, every `every_s` of
-    virtual time; ends as `record` does, with its exit code, which is 1 as well when no frame of the drive has come.
-    Without a machine it is that which the drive reports. replay: a log, instead of a bus; LogDamaged, after the lines
-    of what can be read. UsageError: no such machine, or no signal of a name; OtherDatabase: see Carrier."""
-    address = address if replay is None else str(replay)
-    carrier = Carrier(address, machine, node)
-    shown = _shown(None, node, signals)  # for the names
+def monitor(options: argparse.Namespace) -> int:
+    """Prints signals of the drive of a machine and node number, and of other nodes, every `every_s` of virtual time:
+    the named ones, else the main ones of the drive; ends as `record` does, with its exit code, which is 1 as well when
+    no frame of the drive or of another node with a database has come. Without a machine it is that which the drive
+    reports. replay: a log, instead of a bus; LogDamaged, after the lines of what can be read. dbc: databases of other
+    nodes. With them, or with bus, the load is part of a line, what goes missing a line of its own, and the end is a
+    table of the messages; with bus a line is such a table, too. UsageError: no such machine, database, or signal;
+    OtherDatabase: see Carrier."""
+    address = options.can if options.replay is None else str(options.replay)
+    carrier = Carrier(address, options.machine, options.node)
+    others = load_databases(options.dbc, options.node)
+    lines = _Lines(options, others)
     due_ns, closed = None, None
+    every_ns = round(options.every_s * 1e9)
     heard = True
-    nodes = _Nodes(address, node)
-    frames = nodes.watch(_frames(address, duration_s, "monitoring", nodes.tell_absence) if replay is None
-                         else _logged(replay, duration_s))
+    nodes = _Nodes(address, options.node, others, lines.traffic)
+    frames = nodes.watch(_frames(address, options.duration_s, "monitoring", nodes) if options.replay is None
+                         else _logged(options.replay, options.duration_s))
     try:
         for time_ns, message, begins in identified(frames, carrier):
             if begins:
-                shown = _shown(carrier.likely, node, signals)
+                lines.decode_as(carrier.likely)
                 heard = carrier.machine is not None
-            shown.add(time_ns, message)
-            due_ns = time_ns + round(every_s * 1e9) if due_ns is None else due_ns
+            lines.add(time_ns, message)
+            due_ns = time_ns + every_ns if due_ns is None else due_ns
             if time_ns < due_ns:
                 continue
-            line = shown.line(time_ns)
+            line = lines.line(time_ns)
             if line and not heard and carrier.machine is None and not nodes.absent:
                 heard = True
                 print(f"salient: {address}: no DRIVE_IDENTITY within {IDENTITY_WAIT_NS / 1e9:g} s: the signals are "
                       f"those of {carrier.likely}; --machine states another", file=sys.stderr, flush=True)
             if line:
-                sys.stdout.write(line + "\n")
-                sys.stdout.flush()
-            due_ns += round(every_s * 1e9)
+                _write(line)
+            due_ns += every_ns
     except KeyboardInterrupt:
         pass
     except _BusClosed as end:
         closed = str(end)
-    return _finish(address, duration_s, closed, nodes)
+    finally:
+        lines.finish()
+    return _finish(address, options.duration_s, closed, nodes)
 
 
-def _shown(machine: str | None, node: int, signals: Sequence[str] | None) -> _MainSignals | SelectedSignals:
-    database = drive_database(machine, node)
-    if not signals:
-        return _MainSignals(database)
-    width = shutil.get_terminal_size((_WIDTH, 1)).columns
-    return SelectedSignals((database, rig_database(node)), signals, width)
+def _write(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+class _Lines:
+    """What a monitor prints: signals, and the traffic of the bus where that is wanted."""
+
+    def __init__(self, options: argparse.Namespace, others: Sequence[Database]) -> None:
+        """UsageError: no signal of a name."""
+        self._node, self._signals, self._others = options.node, options.signals, others
+        self._table = options.bus
+        rates = BitRates(options.bit_rate, options.data_bit_rate)
+        self.traffic = Traffic(rates, others, options.node) if options.bus or others else None
+        self._shown = self._signals_of(None)
+
+    def _signals_of(self, machine: str | None) -> _MainSignals | SelectedSignals:
+        database = drive_database(machine, self._node)
+        if not self._signals:
+            return _MainSignals(database)
+        width = shutil.get_terminal_size((_WIDTH, 1)).columns
+        return SelectedSignals((database, rig_database(self._node)), self._signals, width, self._others)
+
+    def decode_as(self, machine: str) -> None:
+        """The drive's machine is known, or taken to be one."""
+        self._shown = self._signals_of(machine)
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        """Takes a frame; what has gone missing before it is told at once."""
+        self._shown.add(time_ns, message)
+        if self.traffic is not None:
+            self.traffic.add(time_ns, message)
+            self.tell_events()
+
+    def tell_events(self) -> None:
+        """Prints what has gone missing and what is back."""
+        for event in self.traffic.take_events() if self.traffic is not None else ():
+            _write(event_line(event))
+
+    def line(self, time_ns: int) -> str:
+        """The values at a time; empty when there are none."""
+        shown = self._shown.line(time_ns)
+        if self.traffic is None:
+            return shown
+        report = self.traffic.report()
+        if not self._table:
+            return f"{shown or f'{time_ns * 1e-9:10.4f} s'}  {load_text(report)}"
+        return "\n".join([*([shown] if self._signals else []), *report_lines(report)])
+
+    def finish(self) -> None:
+        """The table of all messages."""
+        if self.traffic is not None and self.traffic.first_ns is not None:
+            self.tell_events()
+            _write("\n".join(report_lines(self.traffic.total())))
 
 
 def identified(frames: Iterator[tuple[int, can.Message]], carrier: Carrier) -> Iterator[tuple[int, can.Message, bool]]:
@@ -145,13 +205,18 @@ def _from_first(held: list[tuple[int, can.Message]]) -> Iterator[tuple[int, can.
 
 
 class _Nodes:
-    """The drives that are heard on a bus, and one line when the one of a node number is not."""
+    """The drives that are heard on a bus, and one line when the one of a node number is not, nor another node with a
+    database."""
 
-    def __init__(self, address: str, wanted: int | None) -> None:
-        """wanted: its node number; None when none in particular is listened to."""
+    def __init__(self, address: str, wanted: int | None, others: Sequence[Database] = (),
+                 traffic: Traffic | None = None) -> None:
+        """wanted: its node number; None when none in particular is listened to. traffic: is told of silence."""
         self._address = address
         self._wanted = wanted
         self._heard: set[int] = set()
+        self._of_files = {(message.frame_id, message.is_extended_frame) for message in messages_of(others)}
+        self._others_heard = False
+        self._traffic = traffic
         self._from_ns: int | None = None
         self._told = False
 
@@ -160,10 +225,16 @@ class _Nodes:
         """Whether no frame of the drive has come."""
         return self._wanted is not None and self._wanted not in self._heard
 
+    @property
+    def nothing(self) -> bool:
+        """Whether no frame has come that can be decoded."""
+        return self.absent and not self._others_heard
+
     def add(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame; tells when the drive has been absent for _ABSENT_S since the first one."""
         if not self.absent:
             return
+        self._others_heard = self._others_heard or (message.arbitration_id, message.is_extended_id) in self._of_files
         node = None if message.is_extended_id or not has_plain_data(message) else nodes_of_drives().get(
             message.arbitration_id)
         if node is not None:
@@ -171,6 +242,20 @@ class _Nodes:
         self._from_ns = time_ns if self._from_ns is None else self._from_ns
         if time_ns - self._from_ns > _ABSENT_S * 1e9:
             self.tell_absence("; listening on")
+
+    @property
+    def look_s(self) -> float:
+        """Time between two looks at an interface that is silent."""
+        return _ABSENT_S if self._traffic is None else _LOOK_S
+
+    def take_silence(self, silent_s: float, last_ns: int | None) -> None:
+        """No frame has come for a time. last_ns: of the one before, where time goes on by itself."""
+        if silent_s >= _ABSENT_S:
+            self.tell_absence()
+        if self._traffic is not None and last_ns is not None:
+            self._traffic.advance(last_ns + round(silent_s * 1e9))
+            for event in self._traffic.take_events():
+                _write(event_line(event))
 
     def watch(self, frames: Iterator[tuple[int, can.Message]]) -> Iterator[tuple[int, can.Message]]:
         """The frames, each of which is taken."""
@@ -180,11 +265,12 @@ class _Nodes:
 
     def tell_absence(self, end: str = "; listening on") -> None:
         """One line, once, when the drive is absent."""
-        if self.absent and not self._told:
+        if self.nothing and not self._told:
             heard = " and ".join(map(str, sorted(self._heard)))
             others = f", but of node {heard}" if heard else " or of any other drive"
-            print(f"salient: {self._address}: no frame of a drive with node number {self._wanted} (--node){others}"
-                  f"{end}", file=sys.stderr, flush=True)
+            files = " or of the messages of --dbc" if self._of_files else ""
+            print(f"salient: {self._address}: no frame of a drive with node number {self._wanted} (--node){files}"
+                  f"{others}{end}", file=sys.stderr, flush=True)
             self._told = True
 
 
@@ -192,15 +278,15 @@ def _finish(address: str, duration_s: float | None, closed: str | None, nodes: _
     """The exit code, after a line for a bus that closed and for a drive that was not heard."""
     code = 0 if closed is None else _report_closed(address, duration_s, closed)
     nodes.tell_absence("")
-    return 1 if nodes.absent else code
+    return 1 if nodes.nothing else code
 
 
-def _frames(address: str, duration_s: float | None, activity: str, tell_silence: Callable[[], None]
-            ) -> Iterator[tuple[int, can.Message]]:
+def _frames(address: str, duration_s: float | None, activity: str, nodes: _Nodes) -> Iterator[tuple[int, can.Message]]:
     """Frames until `duration_s` of virtual time have passed or an interrupt; _BusClosed when the bus closes first.
-    tell_silence is called where an interface has been silent for _ABSENT_S; the time of a local bus may stand still."""
+    nodes: is told where an interface is silent; the time of a local bus may stand still."""
     end_ns = None
-    timeout_s = None if address.startswith("unix:") else _ABSENT_S
+    timeout_s = None if address.startswith("unix:") else nodes.look_s
+    silent_s, last_ns = 0.0, None
     # A termination request ends the command like an interrupt, so that its output is complete; not one that nohup has
     # set to be ignored.
     for request in (signal.SIGTERM, signal.SIGHUP):
@@ -217,8 +303,10 @@ def _frames(address: str, duration_s: float | None, activity: str, tell_silence:
             except KeyboardInterrupt:
                 return
             if timed is None:
-                tell_silence()
+                silent_s += timeout_s or 0.0
+                nodes.take_silence(silent_s, None if reader.has_virtual_time else last_ns)
                 continue
+            silent_s, last_ns = 0.0, timed[0]
             if end_ns is None and duration_s is not None:
                 end_ns = timed[0] + round(duration_s * 1e9)
             if end_ns is not None and timed[0] > end_ns:

@@ -1,4 +1,4 @@
-"""Lines of signals that are chosen by name, of drive and test bench."""
+"""Lines of signals that are chosen by name, of drive, test bench and other nodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import can
 import cantools
 from cantools.database.can import Database
 
-from salient.bus.signals import Signal, SignalTable, near_signals
+from salient.bus.signals import BusSignals, Signal, SignalTable, is_enumeration, near_signals
 from salient.errors import UsageError
 
 _DECIMALS_MAX = 4
@@ -31,7 +31,8 @@ class _Column:
     def show(self, signal: Signal) -> None:
         """Takes over the latest value, if there is one."""
         if len(signal):
-            self.text = signal.last_name if signal.choices else _number(self.definition, signal.last)
+            number = _number(self.definition, signal.last)
+            self.text = signal.name_of(signal.last, number)
 
     def cell(self) -> str:
         """Name, value of constant width, and unit."""
@@ -41,16 +42,13 @@ class _Column:
 class SelectedSignals:
     """The latest values of signals of some databases, filled frame by frame; a slow signal keeps its value."""
 
-    def __init__(self, databases: Sequence[Database], names: Sequence[str], width: int) -> None:
-        """names: MESSAGE.SIGNAL, or SIGNAL where one message has it; UsageError: none or several do. width: characters
-        of a line, after which it continues on the next."""
-        self._databases = tuple(databases)
+    def __init__(self, databases: Sequence[Database], names: Sequence[str], width: int,
+                 others: Sequence[Database] = ()) -> None:
+        """names: MESSAGE.SIGNAL, or SIGNAL where one message has it, or MESSAGE for all its signals; UsageError: none
+        or several do. width: characters of a line, after which it continues on the next. others: of other nodes."""
         self._width = width
-        self._columns = _columns(self._databases, names)
-        self._clear()
-
-    def _clear(self) -> None:
-        self._tables = [SignalTable(database) for database in self._databases]
+        self._columns = _columns((*databases, *others), names)
+        self._tables = [*map(SignalTable, databases), *map(BusSignals, others)]
 
     def add(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame."""
@@ -61,7 +59,8 @@ class SelectedSignals:
         """The values at a time, on as many lines as they need."""
         for column in self._columns:
             column.show(self._tables[column.table][column.full_name])
-        self._clear()
+        for table in self._tables:
+            table.clear()
         lines = [f"{time_ns * 1e-9:10.4f} s"]
         for cell in (column.cell() for column in self._columns):
             if len(lines[-1]) + 2 + len(cell) > self._width and len(lines[-1]) > len(_INDENT):
@@ -74,14 +73,17 @@ def _columns(databases: Sequence[Database], names: Sequence[str]) -> list[_Colum
     known = {f"{message.name}.{signal.name}": (table, signal)
              for table, database in enumerate(databases)
              for message in sorted(database.messages, key=lambda m: m.frame_id) for signal in message.signals}
-    return [_Column(full_name, name, *known[full_name]) for name in names for full_name in [_resolve(name, known)]]
+    return [_Column(full_name, full_name if full_name.partition(".")[0] == name else name, *known[full_name])
+            for name in names for full_name in _resolve(name, known)]
 
 
-def _resolve(name: str, known: Collection[str]) -> str:
-    """The one of MESSAGE.SIGNAL that a name means."""
+def _resolve(name: str, known: Collection[str]) -> list[str]:
+    """The one of MESSAGE.SIGNAL that a name means, or those of a message."""
+    if of_message := [full_name for full_name in known if full_name.partition(".")[0] == name]:
+        return of_message
     found = [full_name for full_name in known if name in (full_name, full_name.partition(".")[2])]
     if len(found) == 1:
-        return found[0]
+        return found
     if found:
         raise UsageError(f"--signals {name}: in several messages: {', '.join(found)}")
     raise UsageError(f"--signals {name}: no such signal; {near_signals(name, known)}")
@@ -93,13 +95,13 @@ def _number(definition: cantools.database.can.Signal, value: float) -> str:
 
 def _decimals(definition: cantools.database.can.Signal) -> int:
     """Decimals of the least significant bit."""
-    scale = abs(float(definition.scale))
+    scale = abs(float(definition.scale)) or 1.0
     return min(_DECIMALS_MAX, max(0, math.ceil(-math.log10(scale) - 1e-9)))
 
 
 def _width(definition: cantools.database.can.Signal) -> int:
     """Characters of the widest value that the signal can have."""
-    if definition.choices:
+    if definition.choices and is_enumeration(definition):
         return max(len(str(text)) for text in definition.choices.values())
     if definition.is_float:
         return len("-1.23457e-05")

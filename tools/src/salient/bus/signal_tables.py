@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import can
+from cantools.database.can import Database
 
-from salient.bus.decoded_log import FRAME_BYTES, DecodedLog
+from salient.bus.decoded_log import DecodedLog
 from salient.bus.identity import Carrier
 from salient.bus.signals import Signal, drive_database
 from salient.errors import optional_package
@@ -27,14 +28,14 @@ Row = tuple[int, str, str, float, str, str]
 class TableLog(DecodedLog):
     """A table of signals, in the order of time within each 20,000 frames."""
 
-    _finished = 0
+    _finished_bytes = 0
 
     def write(self, time_ns: int, message: can.Message) -> None:
         """Takes a frame."""
         known = self._take(time_ns, message)
-        if (waiting := self._waiting) >= (_BATCH_FRAMES if known else _HELD_MAX):
+        if self._waiting >= (_BATCH_FRAMES if known else _HELD_MAX):
+            self._finished_bytes += self._waiting_bytes
             self._write_kept()
-            self._finished += waiting
 
     def _write_kept(self) -> None:
         self._tables[0].decode_with(drive_database(self._carrier.likely, self._node))
@@ -57,20 +58,20 @@ class TableLog(DecodedLog):
 
     @property
     def size(self) -> int:
-        return FRAME_BYTES * (self._finished + self._waiting)
+        return self._finished_bytes + self._waiting_bytes
 
 
 def _names(signal: Signal) -> list[str]:
     if not signal.choices:
         return [""] * len(signal)
-    return [signal.choices.get(int(value), "") for value in signal.value.tolist()]
+    return [signal.name_of(value) for value in signal.value.tolist()]
 
 
 class CsvLog(TableLog):
     """CSV with the columns time_s, message, signal, value, unit and name."""
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
-        super().__init__(path, carrier, node, source)
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str, others: Sequence[Database] = ()) -> None:
+        super().__init__(path, carrier, node, source, others)
         self._file = path.open("w", encoding="utf-8", newline="")
         self._write(",".join(_COLUMNS) + "\n")
 
@@ -102,8 +103,8 @@ def _seconds(time_ns: int) -> str:
 class ParquetLog(TableLog):
     """Parquet with the columns time_ns (whole), message, signal, value, unit and name."""
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, source: str) -> None:
-        super().__init__(path, carrier, node, source)
+    def __init__(self, path: Path, carrier: Carrier, node: int, source: str, others: Sequence[Database] = ()) -> None:
+        super().__init__(path, carrier, node, source, others)
         pyarrow: Any = optional_package("pyarrow", f"--out {path}: Parquet")
         parquet: Any = optional_package("pyarrow.parquet", f"--out {path}: Parquet")
         self._arrow = pyarrow

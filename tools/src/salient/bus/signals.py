@@ -20,6 +20,8 @@ from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
 
+_TIME_BYTES, _WORD_BYTES = 8, 8
+
 
 @lru_cache
 def load_database(path: Path) -> Database:
@@ -82,7 +84,8 @@ class Signal:
     unit: str
     time_s: np.ndarray
     value: np.ndarray
-    choices: Mapping[int, str] | None = None
+    choices: Mapping[float, str] | None = None
+    """Names by value, not by raw value."""
 
     def __len__(self) -> int:
         return len(self.value)
@@ -100,7 +103,11 @@ class Signal:
     @property
     def last_name(self) -> str:
         """The latest value by its name in the DBC, for signals with named values; "unknown" before the first."""
-        return (self.choices or {}).get(int(self.last), str(self.last)) if len(self.value) else "unknown"
+        return self.name_of(self.last, str(self.last)) if len(self.value) else "unknown"
+
+    def name_of(self, value: float, otherwise: str = "") -> str:
+        """The name of a value in the DBC."""
+        return (self.choices or {}).get(value, otherwise)
 
     def between(self, from_s: float, to_s: float) -> Signal:
         """The part with from_s <= time < to_s."""
@@ -121,10 +128,16 @@ class SignalTable(Mapping[str, Signal]):
         self._times: dict[tuple[int, bool], array[int]] = {}
         self._data: dict[tuple[int, bool], bytearray] = {}
         self._length: dict[tuple[int, bool], int] = {}
+        self._width: dict[tuple[int, bool], int] = {}
+        self.frames = 0
+        """Number of frames of all messages."""
+        self.memory_bytes = 0
+        """Memory of their times and data."""
         self.decode_with(database)
         for key, message in self._messages.items():
             self._times[key], self._data[key] = array("q"), bytearray()
             self._length[key] = message.length
+            self._width[key] = max(_WORD_BYTES, message.length)
 
     def decode_with(self, database: Database) -> None:
         """Decodes by another database from here on, what there is already as well: that of another machine, which has
@@ -148,32 +161,38 @@ class SignalTable(Mapping[str, Signal]):
             return
         self._times[key].append(time_ns)
         self._data[key] += data if len(data) == 8 else data.ljust(8, b"\0")
+        self.frames += 1
+        self.memory_bytes += _TIME_BYTES + _WORD_BYTES
+
+    def clear(self) -> None:
+        """Forgets all frames."""
+        for key, times in self._times.items():
+            if times:
+                self._times[key], self._data[key] = array("q"), bytearray()
+        self.frames = self.memory_bytes = 0
 
     def __getitem__(self, name: str) -> Signal:
         if name not in self._names:
             raise KeyError(f"no signal '{name}'; {near_signals(name, self._names)}")
         raw, time_ns = self._columns(name)
         signal = self._names[name][1]
-        choices = {int(number): str(text) for number, text in (signal.choices or {}).items()}
-        return Signal(signal.name, signal.unit or "", time_ns / 1e9, _physical(raw, signal), choices or None)
+        return Signal(signal.name, signal.unit or "", time_ns / 1e9, physical(raw, signal), names_of_values(signal))
 
     def _columns(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Data as words of 64 bits and times of the frames that carry a signal."""
+        """Data and times of the frames that carry a signal; data: see raw_bits."""
         key, signal = self._names[name]
-        raw = np.frombuffer(bytes(self._data[key]), dtype="<u8")
+        frames = np.frombuffer(bytes(self._data[key]), dtype=np.uint8).reshape(-1, self._width[key])
         time_ns = np.array(self._times[key], dtype=np.int64)
-        if signal.multiplexer_ids:
-            carries = _raw(raw, _multiplexer(self._messages[key])) == signal.multiplexer_ids[0]
-            raw, time_ns = raw[carries], time_ns[carries]
-        return raw, time_ns
+        message = self._messages[key]
+        while (multiplexer := multiplexer_of(message, signal)) is not None:
+            carries = np.isin(raw_bits(frames, multiplexer), signal.multiplexer_ids or [])
+            frames, time_ns = frames[carries], time_ns[carries]
+            signal = multiplexer
+        return frames, time_ns
 
     def times_ns(self, name: str) -> np.ndarray:
         """Times of a signal without the rounding to the floats of `Signal`."""
         return self._columns(name)[1]
-
-    def frames(self) -> int:
-        """Number of frames of all messages."""
-        return sum(map(len, self._times.values()))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -217,27 +236,69 @@ class LatestSignals(SignalTable):
         return self._counts[self._key_of(message_name)]
 
 
-def _physical(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
-    """Physical values of a little-endian signal from frames as 64-bit words."""
-    field = _raw(raw, signal)
+class BusSignals(SignalTable):
+    """The signals of a database of other nodes: flexible data rate frames count, and frames that are longer than the
+    message, as those of a flexible data rate have to be."""
+
+    def add(self, time_ns: int, message: can.Message) -> None:
+        key = (message.arbitration_id, message.is_extended_id)
+        length = self._length.get(key)
+        if length is None or length > len(message.data) or message.is_remote_frame or message.is_error_frame:
+            return
+        self._times[key].append(time_ns)
+        self._data[key] += message.data[: self._width[key]].ljust(self._width[key], b"\0")
+        self.frames += 1
+        self.memory_bytes += _TIME_BYTES + self._width[key]
+
+
+def names_of_values(signal: cantools.database.can.Signal) -> dict[float, str] | None:
+    """Names of a signal by physical value; None without any."""
+    scale, offset = float(signal.scale), float(signal.offset)
+    return {int(number) * scale + offset: str(text) for number, text in (signal.choices or {}).items()} or None
+
+
+def is_enumeration(signal: cantools.database.can.Signal) -> bool:
+    """Whether a signal has named values only: in a quantity, with a unit or a factor, names are exceptions."""
+    return bool(signal.choices) and not signal.unit and signal.scale == 1 and signal.offset == 0
+
+
+def multiplexer_of(message: Message, signal: cantools.database.can.Signal) -> cantools.database.can.Signal | None:
+    """The signal of a message that selects another, by its multiplexer_ids; None when that is always there."""
+    if not signal.multiplexer_ids or signal.multiplexer_signal is None:
+        return None
+    return message.get_signal_by_name(signal.multiplexer_signal)
+
+
+def physical(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
+    """Physical values of a signal, as floats. frames: see raw_bits."""
+    field = raw_bits(frames, signal)
     if signal.is_float:
-        return field.astype("<u4").view("<f4").astype(float)
-    if signal.is_signed:
+        bits = {16: "<u2", 32: "<u4", 64: "<u8"}[signal.length]
+        field = field.astype(bits).view(bits.replace("u", "f")).astype(float)
+    elif signal.is_signed and signal.length <= 64:
         shift = np.int64(64 - signal.length)
         field = (field.astype(np.int64) << shift) >> shift
     return field * float(signal.scale) + float(signal.offset)
 
 
-def _multiplexer(message: Message) -> cantools.database.can.Signal:
-    """The signal that selects the others; a message has at most one."""
-    return next(signal for signal in message.signals if signal.is_multiplexer)
+def big_endian_bit(signal: cantools.database.can.Signal) -> int:
+    """Bits from the first one of a frame to the most significant one of a big-endian signal."""
+    return 8 * (signal.start // 8) + 7 - signal.start % 8
 
 
-def _raw(raw: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
-    """The bits of a little-endian signal."""
-    if signal.byte_order != "little_endian":
-        raise ValueError(f"{signal.name}: only little-endian signals are decoded")
-    field: np.ndarray = raw >> np.uint64(signal.start)
-    if signal.length < 64:
-        field = field & np.uint64((1 << signal.length) - 1)
-    return field
+def raw_bits(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
+    """The bits of a signal as whole numbers without sign, uint64. frames: uint8 of shape (number of frames, bytes of a
+    frame), at least 8 bytes and contiguous."""
+    if signal.byte_order == "little_endian":
+        at = signal.start
+    else:  # in reversed bytes it is a little-endian one
+        frames = np.ascontiguousarray(frames[:, ::-1])
+        at = 8 * frames.shape[1] - big_endian_bit(signal) - signal.length
+    first = min(at // 8, frames.shape[1] - _WORD_BYTES)
+    words = frames.view("<u8")[:, 0] if frames.shape[1] == _WORD_BYTES else np.ascontiguousarray(
+        frames[:, first : first + _WORD_BYTES]).view("<u8")[:, 0]
+    shift = at - 8 * first
+    field: np.ndarray = words >> np.uint64(shift)
+    if shift + signal.length > 64:
+        field = field | frames[:, first + _WORD_BYTES].astype(np.uint64) << np.uint64(64 - shift)
+    return field & np.uint64((1 << signal.length) - 1) if signal.length < 64 else field

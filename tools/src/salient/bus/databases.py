@@ -1,0 +1,135 @@
+"""Databases of the other nodes of a bus: DBC files of their makers, beside those of the drive and its test bench."""
+
+from __future__ import annotations
+
+import logging
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import cantools
+from cantools.database.can import Database, Message
+
+from salient.bus.signals import big_endian_bit, drive_database, rig_database
+from salient.errors import UsageError, shown
+
+OPTION = "--dbc"
+_REASON_MAX = 160  # characters of what the parser says
+_BITS_MAX = 64
+"""Of a signal that is decoded."""
+
+
+def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]:
+    """The databases of files, beside those of the drive with a node number and its test bench.
+
+    A message whose name another one has is named FILE:MESSAGE; its first sender is the node to which it belongs, FILE
+    where the file names none (`node_of`). UsageError, a line that begins with the option: a file cannot be read or is
+    no DBC; it defines no message, or an identifier twice, or one that another database defines, the drive's included.
+    """
+    owners: dict[tuple[int, bool], tuple[str, str]] = {}
+    names: set[str] = set()
+    for database, owner in ((drive_database(None, node), f"the drive with node number {node} (--node)"),
+                            (rig_database(node), "its test bench")):
+        for message in database.messages:
+            owners[_key(message)] = owner, message.name
+            names.add(message.name)
+    reserved = {sender for database in (drive_database(None), rig_database()) for message in database.messages
+                for sender in message.senders}
+    loaded = []
+    for path in paths:
+        database = _load(path)
+        for message in database.messages:
+            owner, other = owners.setdefault(_key(message), (str(path), message.name))
+            if (owner, other) != (str(path), message.name):
+                raise UsageError(f"{OPTION} {path}: {message.name} has the identifier "
+                                 f"{identifier_text(*_key(message))} of {other} of {owner}")
+        label = re.sub(r"\W", "_", path.stem)
+        _name_messages(database, path, label, names, reserved)
+        loaded.append(database)
+    return tuple(loaded)
+
+
+def node_of(message: Message) -> str:
+    """The node that sends a message of load_databases."""
+    return message.senders[0]
+
+
+def identifier_text(identifier: int, is_extended: bool) -> str:
+    """An identifier in hexadecimal digits, as many as it may have."""
+    return f"{identifier:0{8 if is_extended else 3}X}"
+
+
+def _key(message: Message) -> tuple[int, bool]:
+    return message.frame_id, message.is_extended_frame
+
+
+def _load(path: Path) -> Database:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{OPTION} {path}: {error.strerror}") from None
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", errors="replace")  # the encoding of the format
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of is an error here
+    try:
+        database = cantools.database.load_string(text, database_format="dbc", strict=False, prune_choices=False)
+    except Exception as error:  # the parser raises whatever a text leads it to
+        reason = " ".join(str(getattr(error, "e_dbc", error)).split()) or type(error).__name__
+        raise UsageError(f"{OPTION} {path}: no valid DBC: {reason[:_REASON_MAX]}") from None
+    assert isinstance(database, Database)
+    if not database.messages:
+        raise UsageError(f"{OPTION} {path}: no valid DBC: it defines no message")
+    identifiers = [_key(message) for message in database.messages]
+    for message in database.messages:
+        if identifiers.count(_key(message)) > 1:
+            raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name} has the identifier "
+                             f"{identifier_text(*_key(message))} of another message of the file")
+        _check(path, message)
+    return database
+
+
+def _check(path: Path, message: Message) -> None:
+    """UsageError: a frame cannot carry the message. Signals that are too wide are left out, with a line."""
+    longest = 64 if message.is_fd or message.length > 8 else 8
+    if message.length > longest:
+        raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name} has {message.length} bytes, a frame at most "
+                         f"{longest}")
+    for signal in message.signals:
+        big_endian = signal.byte_order == "big_endian"
+        first = big_endian_bit(signal) if big_endian else signal.start
+        if not 0 <= first < first + signal.length <= 8 * message.length:
+            raise UsageError(f"{OPTION} {path}: no valid DBC: signal {shown(signal.name)} is beyond the "
+                             f"{message.length} bytes of {message.name}")
+        if signal.is_float and signal.length not in (16, 32, 64):
+            raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name}.{signal.name} is a floating-point number "
+                             f"of {signal.length} bits")
+    wide = [signal for signal in message.signals if signal.length > _BITS_MAX]
+    for signal in wide:
+        print(f"salient: {OPTION} {path}: {message.name}.{signal.name} has {signal.length} bits, more than "
+              f"{_BITS_MAX}, and is left out", file=sys.stderr, flush=True)
+        message.signals.remove(signal)
+
+
+def _name_messages(database: Database, path: Path, label: str, names: set[str], reserved: Iterable[str]) -> None:
+    """Gives the messages names and nodes that are not those of others. label: of the file."""
+    for message in database.messages:
+        if message.name in names:
+            message.name = f"{label}:{message.name}"
+        if message.name in names:
+            message.name = f"{message.name}_{identifier_text(*_key(message))}"
+        names.add(message.name)
+    if not any(message.senders for message in database.messages):
+        print(f"salient: {OPTION} {path}: names no node that sends: its messages are those of {label}",
+              file=sys.stderr, flush=True)
+    for message in database.messages:
+        sender = next(iter(message.senders), label)
+        message.senders.insert(0, f"{label}:{sender}" if sender in reserved else sender)
+
+
+def messages_of(databases: Iterable[Database]) -> Iterator[Message]:
+    """The messages of some databases, by identifier within each."""
+    for database in databases:
+        yield from sorted(database.messages, key=lambda message: message.frame_id)
