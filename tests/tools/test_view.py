@@ -493,7 +493,7 @@ def test_a_failure_folder_is_replayed_with_its_machine_and_its_values(browser, m
     page = visitor.page
     assert page.inner_text("#machine-name") == "linear_trapezoid"
     assert page.locator("#take").is_hidden() and page.locator("[role=tab]").all_inner_texts() == ["Stimulus", "Signals",
-                                                                                                   "Cursors"]
+                                                                                                   "Bus", "Cursors"]
     assert page.locator("#stimuli tbody tr").all_inner_texts() == [
         "1\t0.000000 s\trun in speed mode, speed_reference_rpm = 600 r/min",
         "2\t0.300000 s\tload_torque_Nm = 6 N m (scheduled at 0.000000 s)"]

@@ -6,17 +6,22 @@ import argparse
 import json
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import can
+from cantools.database.can import Database
 
 from salient.bench.stimulus import STIMULI, Stimulus, act_frames, stimuli
 from salient.bus.clock import VirtualTimeReader, open_bus
+from salient.bus.databases import load_databases
+from salient.bus.frame_bits import BitRates
 from salient.bus.identity import IDENTITY_WAIT_NS, Carrier
 from salient.bus.log_reader import KnownFrames, LogDamaged, NoKnownFrame, read_log
+from salient.bus.traffic import Traffic
+from salient.config import DEFAULTS
 from salient.errors import UsageError
 from salient.version import VERSION
 from salient.view.commands import COMMANDS
@@ -24,6 +29,7 @@ from salient.view.description import description
 from salient.view.frames import Chunk, FrameStore
 from salient.view.link import Link
 from salient.view.server import Feed, Server
+from salient.view.traffic_feed import TrafficFeed
 
 _CHUNK_FRAMES = 100_000
 _FAILURE_NOTES = "bench.json"
@@ -34,11 +40,13 @@ _SILENCE_S = 1.0
 class BusFeed:
     """The frames of a bus, for each page from the moment at which it was opened."""
 
-    def __init__(self, address: str, machine: str, node: int) -> None:
-        self.info = {**description(machine, node), "kind": "live", "title": address, "commands": ["take", "release",
-                     *COMMANDS], "build": f"salient {VERSION}", "period_ms": 0}
+    def __init__(self, address: str, machine: str, node: int, others: Sequence[Database], rates: BitRates) -> None:
+        """others: databases of other nodes."""
+        self.info = {**description(machine, node, others), "kind": "live", "title": address,
+                     "commands": ["take", "release", *COMMANDS], "build": f"salient {VERSION}", "period_ms": 0}
         self.store = FrameStore()
-        self.link = Link(address, machine, node, self.store)
+        self.traffic = TrafficFeed(Traffic(rates, others, node))
+        self.link = Link(address, machine, node, self.store, self.traffic)
         self.link.start()
 
     @property
@@ -54,18 +62,21 @@ class LogFeed:
 
     link = None
 
-    def __init__(self, path: Path, carrier: Carrier, node: int, acts: list[Stimulus] | None = None) -> None:
-        """acts: what was done; without it what the log has of that. OtherDatabase: see Carrier.
-        NoKnownFrame."""
+    def __init__(self, path: Path, carrier: Carrier, node: int, acts: list[Stimulus] | None = None,
+                 others: Sequence[Database] = (), rates: BitRates | None = None) -> None:
+        """acts: what was done; without it what the log has of that. others: databases of other nodes. rates: by default
+        those of the emulated bus. OtherDatabase: see Carrier. NoKnownFrame."""
+        self.traffic = TrafficFeed(Traffic(rates or BitRates(DEFAULTS["bit_rate"]), others, node), of_all_time=True)
         self.store = FrameStore(kept=1 << 62)
         chunk = Chunk()
         first_ns, last_ns = None, 0
         of_hosts: list[tuple[int, can.Message]] = []
         relevant = act_frames(None, (node,)) if acts is None else {}
-        known = KnownFrames(node)
+        known = KnownFrames(node, others)
         for time_ns, message in self._frames(path):
             carrier.take(message)
             known.add(message)
+            self.traffic.add(time_ns, message)
             if (message.arbitration_id, message.is_extended_id) in relevant:
                 of_hosts.append((time_ns, message))
             if chunk.add(time_ns, message):
@@ -78,11 +89,12 @@ class LogFeed:
         if first_ns is None:
             raise NoKnownFrame(self.damage or f"--replay {path}: the log has no data frame")
         known.require(self.damage or f"--replay {path}")
+        self.traffic.finish()
         machine = carrier.likely
         if acts is None:
             acts = stimuli(of_hosts, last_ns, machine, (node,))
         self.ended = f"{path.name}: {self.store.next_number} frames"
-        self.info = {**description(machine, node), "kind": "replay", "title": str(path), "commands": [],
+        self.info = {**description(machine, node, others), "kind": "replay", "title": str(path), "commands": [],
                      "build": f"salient {VERSION}", "period_ms": 0, "start_ns": first_ns, "end_ns": last_ns,
                      "stimuli": [asdict(stimulus) for stimulus in acts]}
 
@@ -103,15 +115,18 @@ def run(options: argparse.Namespace) -> int:
     """Serves the page until an interrupt; prints its link. Returns 1 when a log was read up to its damage."""
     feed: Feed
     damage = ""
+    rates = BitRates(options.bit_rate, options.data_bit_rate)
     if options.replay is None:
+        others = load_databases(options.dbc, options.node or 0)
         carrier = Carrier(options.can, options.machine, options.node or 0)
         _listen(options.can, carrier)
-        feed = BusFeed(options.can, carrier.likely, options.node or 0)
+        feed = BusFeed(options.can, carrier.likely, options.node or 0, others, rates)
     else:
         path, notes = _log_of(options.replay)
         node = notes.get("node", 0) if options.node is None else options.node
+        others = load_databases(options.dbc, node)
         carrier = Carrier(str(path), options.machine, node, noted=notes.get("machine"))
-        feed = LogFeed(path, carrier, node, _acts_of(notes))
+        feed = LogFeed(path, carrier, node, _acts_of(notes), others, rates)
         damage = feed.damage
         if damage:
             print(f"salient: {damage}", file=sys.stderr, flush=True)

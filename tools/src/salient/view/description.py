@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import numpy as np
 from cantools.database.can import Database, Message, Signal
 
 from salient.bench.faults import FaultKind, fault_kinds
-from salient.bus.signals import drive_database, rig_database, signal_range
+from salient.bus.databases import messages_of
+from salient.bus.signals import big_endian_bit, drive_database, is_enumeration, rig_database, signal_range
 from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine.drive_data import derive
@@ -20,16 +21,20 @@ from salient.machine.parameter_table import CHOICES
 
 EXTENDED = 0x80000000
 """Flag of a 29-bit identifier, as in can_id of Linux."""
+_BYTES_MAX = 8
 _MAP_ANGLES, _MAP_CURRENTS = 61, 41
 
 
-def description(machine: str, node: int) -> dict[str, Any]:
-    """Databases, machine, faults and named values of parameters of a drive; UsageError: no such machine."""
+def description(machine: str, node: int, others: Sequence[Database] = ()) -> dict[str, Any]:
+    """Databases, machine, faults and named values of parameters of a drive; others: databases of other nodes, of which
+    a page has the messages of up to 8 bytes. UsageError: no such machine."""
     try:
         path = machine_path(machine)
         return {
             "databases": [_message(message) for database in (drive_database(machine, node), rig_database(node))
-                          for message in _sorted(database)],
+                          for message in _sorted(database)]
+                         + [_message(message, is_of_file=True) for message in messages_of(others)
+                            if message.length <= _BYTES_MAX],
             "database_hash": database_hash(drive_database(machine)),
             "machine": machine_of(path),
             "faults": [_fault(kind) for kind in fault_kinds().values()],
@@ -65,25 +70,28 @@ def _sorted(database: Database) -> list[Message]:
     return sorted(database.messages, key=lambda message: message.frame_id)
 
 
-def _message(message: Message) -> dict[str, Any]:
+def _message(message: Message, *, is_of_file: bool = False) -> dict[str, Any]:
     return {
         "id": message.frame_id | (EXTENDED if message.is_extended_frame else 0), "name": message.name,
         "node": message.senders[0], "length": message.length, "comment": message.comment or "",
         "signals": [_signal(signal) for signal in message.signals],
+        **({"may_be_longer": True} if is_of_file else {}),
     }
 
 
 def _signal(signal: Signal) -> dict[str, Any]:
-    if signal.byte_order != "little_endian":
-        raise ValueError(f"{signal.name}: only little-endian signals are decoded")
-    choices: Mapping[int, object] = signal.choices or {}
+    choices: Mapping[int, object] = (signal.choices or {}) if is_enumeration(signal) else {}
+    is_reversed = signal.byte_order != "little_endian"
+    start = 8 * _BYTES_MAX - big_endian_bit(signal) - signal.length if is_reversed else signal.start
     return {
-        "name": signal.name, "unit": signal.unit or "", "comment": signal.comment or "", "start": signal.start,
+        "name": signal.name, "unit": signal.unit or "", "comment": signal.comment or "", "start": start,
         "length": signal.length, "signed": signal.is_signed, "float": signal.is_float,
         "factor": float(signal.scale), "offset": float(signal.offset), "minimum": _number(signal.minimum),
         "maximum": _number(signal.maximum),
         "choices": {str(number): str(text) for number, text in sorted(choices.items())} or None,
         "multiplexer": signal.is_multiplexer, "multiplexed": signal.multiplexer_ids,
+        **({"selector": signal.multiplexer_signal} if signal.multiplexer_ids else {}),
+        **({"reversed": True} if is_reversed else {}),
     }
 
 

@@ -18,6 +18,7 @@ from salient.bus.clock import VirtualTimeReader, open_bus
 from salient.bus.identity import OtherDatabase, hash_of, machines_of
 from salient.bus.signals import LatestSignals, SignalTable, drive_database, rig_database
 from salient.view.frames import Chunk, FrameStore
+from salient.view.traffic_feed import TrafficFeed
 
 _TICK_S = 0.004
 """Between two looks at the bus: less than half the period of the commands."""
@@ -56,7 +57,7 @@ class DriveTime:
 class Link:
     """One drive on a bus. `call` runs a function in the thread of the bus, where drive and rig may be used."""
 
-    def __init__(self, address: str, machine: str, node: int, store: FrameStore) -> None:
+    def __init__(self, address: str, machine: str, node: int, store: FrameStore, traffic: TrafficFeed) -> None:
         self.address = address
         self.time_ns = 0
         self.ended = False
@@ -67,6 +68,7 @@ class Link:
         self.truth: SignalTable = LatestSignals(self.rig_database, "RIG")
         self._machine = machine
         self._store, self._chunk = store, Chunk()
+        self._traffic = traffic
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
         self._wake = threading.Event()
         self._stopping = False
@@ -200,6 +202,7 @@ class Link:
         self.time_ns = max(self.time_ns, time_ns)
         self.telemetry.add(time_ns, message)
         self._chunk.add(time_ns, message)
+        self._traffic.add(time_ns, message)
         if (due_ns := self.drive.due_ns) is not None and due_ns <= self.time_ns:
             self._send_due()
         return message

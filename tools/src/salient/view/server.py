@@ -22,6 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from salient.view.commands import Commander, Malformed, check_command
 from salient.view.frames import FrameStore
 from salient.view.link import SHOWN_WITHIN_NS, Link
+from salient.view.traffic_feed import TrafficFeed
 
 PAGE = Path(__file__).parent / "page"
 LOOK = Path(__file__).parents[1] / "pages" / "look.css"
@@ -45,6 +46,7 @@ class Feed(Protocol):
 
     info: dict[str, Any]
     store: FrameStore
+    traffic: TrafficFeed
 
     @property
     def link(self) -> Link | None:
@@ -269,6 +271,7 @@ class Server:
             "lease": "yours" if holder is page else "free" if holder is None else "other",
             "malformed": self.malformed,
             "text": "",
+            "traffic": self.feed.traffic.state,
         }
         if page.has_slept:
             notice["text"] = "command was released: this page slept, and the drive stops by its command timeout"

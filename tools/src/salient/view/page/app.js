@@ -1,5 +1,6 @@
 // The live page: joins a source of frames with plots, pictures and controls.
 
+import { showTraffic } from "./bus.js";
 import { Charts, csvOf } from "./charts.js";
 import { ActiveFaults, element, makeFaults, makeParameters, makeRecord, makeRun, makeSignals, makeStimuli, makeTabs, showCursors }
     from "./controls.js";
@@ -59,7 +60,7 @@ class Page {
         element("title").title = info.title;
         document.title = `Salient: ${info.title}`;
         const acts = info.stimuli ?? [];
-        makeTabs(acts.length ? [...info.commands, "stimuli"] : info.commands);
+        makeTabs([...info.commands, ...(acts.length ? ["stimuli"] : []), ...(info.kind === "tab" ? [] : ["traffic"])]);
         makeStimuli(acts, (time_ns) => this.zoom(time_ns - 0.2 * this.timeline.window_ns,
                                                  time_ns + 0.8 * this.timeline.window_ns));
         this.charts.stimuli_s = acts.map((act) => act.time_s);
@@ -104,6 +105,10 @@ class Page {
         }
         if (notice.text && !this.isReplay) {
             this.tell(notice.text);
+        }
+        if (notice.traffic) {
+            showTraffic(notice.traffic, (time_ns) => this.zoom(time_ns - 0.5 * this.timeline.window_ns,
+                                                               time_ns + 0.5 * this.timeline.window_ns));
         }
         this.malformed = notice.malformed ?? this.malformed;
         this.ended = notice.ended ?? this.ended;

@@ -13,7 +13,7 @@ export function make(tag, properties = {}, ...children) {
 }
 
 /** A name in a narrow column: it may break after an underscore. */
-function breakable(name) {
+export function breakable(name) {
     return name.split(/(?<=_)/).flatMap((part, index) => (index ? [make("wbr"), part] : [part]));
 }
 

@@ -39,12 +39,26 @@
 //     text?: string;           // one line to show
 //     ended?: boolean;         // no more frames will come
 //     malformed?: number;      // messages of pages that were dropped, so far
+//     traffic?: Traffic;       // of the last half second, of a log of all its time; null before the first
+// }
+//
+// interface Traffic {
+//     load: number; peak: number;         // parts of the time; peak: the greatest of 100 ms so far
+//     frames: number; errors: number; duration_s: number;
+//     nodes: { name: string, share: number, silent: boolean, messages: MessageTraffic[] }[];
+//     unknown: MessageTraffic[]; unknown_count: number;   // the most frequent identifiers of no database; of how many
+//     events: { time_ns: number, text: string }[];        // what went missing and came back, the latest ones
+// }
+//
+// interface MessageTraffic {
+//     id: string; name: string; frames: number; state: "" | "missing" | "never" | "wrong length";
+//     cycle_ms: number | null; expected_ms: number | null; shortest_ms: number; longest_ms: number;
 // }
 //
 // interface Info {
 //     kind: "live" | "replay" | "tab";
 //     title: string;           // the bus, the file, the build
-//     databases: Message[];    // of both DBCs: drive and test bench
+//     databases: Message[];    // of drive, test bench and other nodes
 //     database_hash: number;   // of the drive's DBC above, as DRIVE_IDENTITY.dbc_hash reports it
 //     machine: Machine;
 //     faults: FaultKind[];     // that the test bench knows; empty without one
@@ -58,18 +72,21 @@
 //
 // interface Message {
 //     id: number;              // as Batch.id
-//     name: string; node: "DRIVE" | "RIG" | "HOST"; length: number; comment: string;
+//     name: string; node: string; length: number; comment: string;   // node: the sender
+//     may_be_longer?: boolean; // frames of this length or more count, else of this one
 //     signals: Signal[];
 // }
 //
 // interface Signal {
 //     name: string; unit: string; comment: string;
 //     start: number; length: number;      // little endian: least significant bit and number of bits
-//     signed: boolean; float: boolean;    // float: IEEE 754, 32 bits
+//     reversed?: boolean;                 // in the eight bytes in opposite order: a big-endian signal
+//     signed: boolean; float: boolean;    // float: IEEE 754, of 16, 32 or 64 bits
 //     factor: number; offset: number; minimum: number | null; maximum: number | null;
 //     choices: { [number: string]: string } | null;
 //     multiplexer: boolean;               // its value selects the signals of its message
 //     multiplexed: number[] | null;       // values of the multiplexer with which this signal is there; null: always
+//     selector?: string;                  // that multiplexer
 // }
 //
 // interface Machine {

@@ -159,7 +159,8 @@ export class Store {
             const high = words[2 * i + 1];
             const arrived_ns = batch.time_ns[i];
             this.last_ns = arrived_ns;
-            if (entry === undefined || batch.length[i] !== entry.message.length) {
+            if (entry === undefined || (batch.length[i] !== entry.message.length
+                && !(entry.message.may_be_longer && batch.length[i] > entry.message.length))) {
                 this.unknown += 1;
                 continue;
             }
