@@ -312,7 +312,7 @@ def test_a_log_of_other_nodes_alone_is_converted_and_one_of_nobody_is_not(salien
 
 
 @pytest.mark.in_turns
-@pytest.mark.parametrize(("suffix", "seconds", "rotation"), [(".blf", 30.0, "1MB"), (".csv", 4.0, "1s")])
+@pytest.mark.parametrize(("suffix", "seconds", "rotation"), [(".blf", 12.0, "400kB"), (".csv", 4.0, "1s")])
 def test_full_load_with_rotation_loses_nothing_in_constant_memory(tmp_path, suffix, seconds, rotation):
     bus, files = record(tmp_path, seconds, rotation, suffix)
     assert len(files) >= 3

@@ -48,8 +48,9 @@ def report_lines(report: Report) -> Iterator[str]:
 
 def _figures(message: MessageReport) -> str:
     cycle = "-" if message.cycle_ns is None else f"{message.cycle_ns / _MS_NS:.3f}"
-    expected = f"{message.expected_ns / _MS_NS:g}" if message.expected_ns else "-"
-    text = f"{message.frames:>7} frames  cycle {cycle:>9} ms, expected {expected:>5} ms"
+    text = f"{message.frames:>7} frames  cycle {cycle:>9} ms"
+    if message.expected_ns:
+        text += f", expected {message.expected_ns / _MS_NS:>5g} ms"
     if message.cycle_ns is not None:
         text += f", {message.shortest_ns / _MS_NS:.3f} to {message.longest_ns / _MS_NS:.3f} ms"
     return text + (f"  {message.state}" if message.state else "")
