@@ -83,8 +83,8 @@ void load_observer_reset(load_observer_t *observer, uint32_t angle);
  * rev). Unsaturated, a jump of the encoder would show as overspeed. */
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle);
 
-/* Correction of an innovation, as above, 2^-32 rev; the half is rounded up. half_count: 2^-32 rev, below 2^27; 0 where
- * the angle is not the middle of a count. */
+/* Correction of an innovation, as above, 2^-32 rev; the half is rounded up. half_count: 2^-32 rev, below 2^27. For
+ * an angle that is the middle of a count; one from the time of an edge or between slow counts is known better. */
 int32_t load_observer_correction(int32_t innovation, uint32_t half_count);
 
 /* One sample: corrects by a correction (-2^27..2^27 - 1), then predicts one period ahead with the machine torque (N

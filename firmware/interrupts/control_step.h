@@ -122,7 +122,6 @@ typedef struct {
 typedef struct {
     uint32_t encoder_angle;             /* start of the encoder count, 2^-32 rev */
     uint32_t angle;                     /* rotor, 2^-32 rev */
-    uint32_t half_count;                /* where the angle is the middle of a count; else 0; 2^-32 rev */
     bool angle_from_edge;               /* extrapolated from the time of an encoder edge; false: middle of the count */
     int32_t predicted_speed_q22;        /* observer's prediction for this sample, rad/s, Q9.22 */
     int32_t dc_link_voltage_q6;         /* V, Q9.6 */

@@ -26,16 +26,11 @@ static void measure_angle(const control_parameters_t *parameters, const load_obs
     const uint32_t count_start = encoder->counts << parameters->encoder_shift;
     measured->encoder_angle = count_start;
     measured->predicted_speed_q22 = observer->speed_q22;
-    measured->half_count = 0;
-    if (!encoder->edge_known && slow_counts->slow) {
-        measured->angle_from_edge = false;
-        measured->angle = slow_counts_angle(slow_counts, observer, count_start, parameters->encoder_shift);
-        return;
-    }
     if (!encoder->edge_known) {
         measured->angle_from_edge = false;
-        measured->half_count = parameters->encoder_middle;
-        measured->angle = count_start + parameters->encoder_middle; /* its mean error is zero */
+        measured->angle = slow_counts->slow
+                              ? slow_counts_angle(slow_counts, observer, count_start, parameters->encoder_shift)
+                              : count_start + parameters->encoder_middle; /* its mean error is zero */
         return;
     }
     if (encoder->edge_age_ticks > parameters->edge_age_max_ticks) {
