@@ -121,20 +121,16 @@ int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle
     return fixed_clamp((int32_t)(angle - predicted), -INNOVATION_LIMIT, INNOVATION_LIMIT - 1);
 }
 
-int32_t load_observer_correction(int32_t innovation, uint32_t half_count) {
-    return innovation - (fixed_clamp(innovation, -(int32_t)half_count, (int32_t)half_count) >> 1);
-}
-
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t correction,
+                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t innovation,
                         int32_t torque_q24) {
-    const int32_t correction_q4 = correction * 16;
+    const int32_t innovation_q4 = innovation * 16;
 
     /* Correct. */
-    int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, correction_q4, gains->angle_gain_q28);
-    observer->speed_correction_q22 = fixed_product_shift_saturate(correction_q4, gains->speed_gain_q24, 28);
+    int64_t angle_q64 = fixed_accumulate((int64_t)observer->angle_q64, innovation_q4, gains->angle_gain_q28);
+    observer->speed_correction_q22 = fixed_product_shift_saturate(innovation_q4, gains->speed_gain_q24, 28);
     const int32_t speed_q22 = fixed_add(observer->speed_q22, observer->speed_correction_q22);
-    const int32_t unscaled_q24 = fixed_multiply_high(correction_q4, gains->load_gain_q28);
+    const int32_t unscaled_q24 = fixed_multiply_high(innovation_q4, gains->load_gain_q28);
     const int32_t load_factor_q4 = (gains->load_factor_q4 << 2) >> inertia->load_shift; /* at most 2^23 */
     const int32_t load_correction_q24 = fixed_product_shift_saturate(unscaled_q24, load_factor_q4, 4);
     const int32_t load_q24 = fixed_add(observer->load_torque_q24, load_correction_q24);

@@ -12,16 +12,6 @@
  * Derived here for B = 0, by equating coefficients of the characteristic polynomial:
  *   z^3 + (l1 + l2 Ts + l3 Ts^2 / 2 - 3) z^2 + (3 - 2 l1 - l2 Ts + l3 Ts^2 / 2) z + l1 - 1 = (z - q)^3
  *
- * The count of an encoder says that the angle is within half a count of its middle, no more: there the innovation
- * corrects half, beyond it whole,
- *
- *   correction = e - clamp(e, -count / 2, count / 2) / 2
- *
- * so that rounding reaches speed and torque at half its size, and a load step, which moves the angle by counts, nearly
- * at its own. With all gains halved the characteristic polynomial of the triple pole, (s + 1)^3, becomes (s + 1/2)
- * (s^2 + s + 1), of damping 1/2; below 1/9 it is unstable (derived here), as a loop of three integrators is when its
- * gain falls: a dead zone of a count has a limit cycle, and half the gain leaves an inertia of 2/9 of the assumed one.
- *
  * The paper assumes T_L to be known, which it is not in a drive.
  */
 #ifndef CONTROL_LOAD_OBSERVER_H
@@ -83,17 +73,13 @@ void load_observer_reset(load_observer_t *observer, uint32_t angle);
  * rev). Unsaturated, a jump of the encoder would show as overspeed. */
 int32_t load_observer_innovation(const load_observer_t *observer, uint32_t angle);
 
-/* Correction of an innovation, as above, 2^-32 rev; the half is rounded up. half_count: 2^-32 rev, below 2^27. For
- * an angle that is the middle of a count; one from the time of an edge or between slow counts is known better. */
-int32_t load_observer_correction(int32_t innovation, uint32_t half_count);
-
-/* One sample: corrects by a correction (-2^27..2^27 - 1), then predicts one period ahead with the machine torque (N
+/* One sample: corrects with its innovation (-2^27..2^27 - 1), then predicts one period ahead with the machine torque (N
  * m, Q7.24). Afterwards angle, speed and load torque are the estimate for the coming sample. 64-bit products and angle
  * accumulator. Speed correction, friction torque and half of the speed change are rounded down, the speed change to
  * nearest, the load correction to nearest before its factor and down after it; speed and load torque saturate, the
  * speed correction to within 16 LSB of the end. */
 void load_observer_step(const load_observer_model_t *model, const load_observer_gains_t *gains,
-                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t correction,
+                        const load_observer_inertia_t *inertia, load_observer_t *observer, int32_t innovation,
                         int32_t torque_q24);
 
 #endif

@@ -114,7 +114,7 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
                           const observer_bandwidth_sample_t *sample, uint32_t rounding_q4, bool hold) {
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
-        fixed_accumulate(moving->trend_q36, fixed_subtract(sample->correction * 16, trend_q4), parameters->gain_q32);
+        fixed_accumulate(moving->trend_q36, fixed_subtract(sample->innovation * 16, trend_q4), parameters->gain_q32);
     const uint32_t base_q4 = sample->from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
     const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
     const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);

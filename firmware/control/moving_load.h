@@ -1,7 +1,7 @@
 /* Moving load: a load that changes all the time, as that of a piston compressor, detected by the trend of the
- * observer's corrections.
+ * innovation.
  *
- * The load observer assumes a constant load. Under one that changes at a rate r its correction has the mean
+ * The load observer assumes a constant load. Under one that changes at a rate r its innovation has the mean
  *
  *   e = r / (J w0^3)
  *
@@ -9,7 +9,7 @@
  * the threshold of observer_bandwidth.h, which belongs to single samples, and that threshold follows it. So the mean is
  * looked for by itself:
  *
- *   trend += (correction - trend) Ts / 1.6 ms
+ *   trend += (innovation - trend) Ts / 1.6 ms
  *
  * The ripple of the drive itself has a trend as well, which a light rotor or a slow one shows. The wide bandwidth then
  * only adds noise, of J w0^2 count / 4 to the estimate, and ripple. The load has moved when the range of the estimate
@@ -28,11 +28,10 @@
  *
  *   rounding = max over q of 1 / (2 q) / (4 n + 1) counts,   n = |q r - p| T / Ts
  *
- * which is added to a threshold of 1/8 count, below which all q > 4 stay by themselves. The correction has half of it
- * where the estimate is right, and more where it is off, so that all of it is added. A trend withholds the last stages
- * of the bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such trend,
- * one each 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The value 1/8 is found
- * by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5
+ * which is added to a threshold of 1/8 count, below which all q > 4 stay by themselves. A trend withholds the last
+ * stages of the bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such
+ * trend, one each 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The value 1/8 is
+ * found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5
  * makes the speed drop of a load ramp of 200 ms that of the paper's controller twice over.
  *
  * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend: of
@@ -74,7 +73,7 @@ typedef enum {
 
 /* All zero at the start. */
 typedef struct {
-    int64_t trend_q36;   /* low-pass of the correction, 2^-32 rev, Q27.36 */
+    int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
     uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */

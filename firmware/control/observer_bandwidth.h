@@ -117,7 +117,6 @@ typedef struct {
 /* Sample for the statistics. */
 typedef struct {
     int32_t innovation; /* 2^-32 rev */
-    int32_t correction; /* of load_observer_correction, 2^-32 rev; for moving_load.h */
     bool from_edge;
     unsigned stage;             /* after the sample */
     observer_trigger_t trigger; /* since the last update */

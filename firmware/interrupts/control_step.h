@@ -179,7 +179,6 @@ typedef struct {
     uint32_t reported_fault_mask; /* failed checks of the background, which writes it in one access; FAULT_BITs */
     bool started;                 /* the first sample has initialised observer and protection */
     int32_t innovation;           /* of the last sample, 2^-32 rev */
-    int32_t correction;           /* of the observer by it, 2^-32 rev */
     load_observer_t observer;
     observer_bandwidth_t bandwidth;
     protection_t protection;

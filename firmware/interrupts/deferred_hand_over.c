@@ -36,7 +36,6 @@ void deferred_reset_observer(control_state_t *state) {
 
 static void hand_over_bandwidth(control_state_t *state, deferred_input_t *input) {
     input->bandwidth.innovation = state->innovation;
-    input->bandwidth.correction = state->correction;
     input->bandwidth.from_edge = state->measurement.angle_from_edge;
     input->bandwidth.stage = state->bandwidth.stage;
     input->bandwidth.trigger = state->bandwidth.trigger;

@@ -54,20 +54,12 @@ static const load_observer_gains_t *slow_gains(const control_parameters_t *param
 void observe(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred) {
     const control_measurement_t *measured = &state->measurement;
     const int32_t innovation = load_observer_innovation(&state->observer, measured->angle);
-    const load_observer_gains_t *gains;
-    int32_t correction = innovation;
-    if (deferred->slow_counts.slow) {
-        gains = slow_gains(parameters, state, &deferred->slow_counts);
-    } else {
-        gains = observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
-                                        &measured->angle_from_edge);
-        if (!measured->angle_from_edge) {
-            correction = load_observer_correction(innovation, parameters->encoder_middle);
-        }
-    }
+    const load_observer_gains_t *gains =
+        deferred->slow_counts.slow
+            ? slow_gains(parameters, state, &deferred->slow_counts)
+            : observer_bandwidth_step(&parameters->bandwidth, &state->bandwidth, &deferred->bandwidth, innovation,
+                                      &measured->angle_from_edge);
     state->innovation = innovation;
-    state->correction = correction;
     const int32_t torque_q24 = fixed_subtract(measured->torque_sum_q24, deferred->speed.periodic_load_q24);
-    load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, state->correction,
-                       torque_q24);
+    load_observer_step(&parameters->observer, gains, &deferred->observer, &state->observer, innovation, torque_q24);
 }

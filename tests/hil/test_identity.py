@@ -20,11 +20,12 @@ from salient.bus.log import write_logs
 from salient.bus.log_reader import convert
 from salient.bus.monitor import monitor, record
 from salient.bus.signals import drive_database
+from salient.cli import make_parser
 from salient.config import DEFAULTS, BenchConfig
 from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine import cache
-from salient.machine.cache import machine_hash
+from salient.machine.content import machine_hash
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine
 from salient.machine.path import machine_path
@@ -99,9 +100,15 @@ def supply_V(path: Path) -> float:
         return float(file.get(group=group, index=index).samples[-1])
 
 
+def watch(can: str, machine: str | None) -> int:
+    """`tools/salient monitor` for 0.2 s; its exit code."""
+    stated = [] if machine is None else ["--machine", machine]
+    return monitor(make_parser().parse_args(["monitor", "--can", can, "--every-s", "0.05", "--duration-s", "0.2", *stated]))
+
+
 @pytest.mark.in_turns
 def test_every_tool_finds_the_machine_of_a_drive(other_drive, tmp_path, capsys):
-    assert monitor(other_drive, 0.05, 0.2, None) == 0
+    assert watch(other_drive, None) == 0
     read_V = {float(text) for text in re.findall(r"DC link +([\d.]+) V", capsys.readouterr().out)}
     assert min(read_V) == max(read_V) == pytest.approx(SUPPLY_V, rel=0.01)
     assert record(other_drive, tmp_path / "x.mf4", 0.15, None) == 0
@@ -125,7 +132,7 @@ def test_every_tool_refuses_another_machine_than_stated_in_one_line(other_drive,
     options = argparse.Namespace(can=other_drive, machine="saturating", node=0, action="save", file=tmp_path / "p.toml",
                                  out=tmp_path / "scope")
     runs = {
-        "monitor": lambda machine: monitor(other_drive, 0.05, 0.2, machine),
+        "monitor": lambda machine: watch(other_drive, machine),
         "log": lambda machine: record(other_drive, tmp_path / "x.mf4", 0.2, machine),
         "convert": lambda machine: convert(tmp_path / "x.blf", tmp_path / "y.mf4", machine),
         "view": lambda machine: LogFeed(tmp_path / "x.blf", Carrier(str(tmp_path / "x.blf"), machine), 0),

@@ -28,9 +28,11 @@ from websockets.sync.client import connect
 
 from salient.bench import failure
 from salient.bench.drive import DriveError
+from salient.bus.frame_bits import BitRates
 from salient.bus.identity import Carrier
 from salient.bus.log import write_logs
 from salient.bus.signals import drive_database, rig_database
+from salient.bus.traffic import Traffic
 from salient.machine.parameter_table import CHOICES, value_name
 from salient.paths import ROOT
 from salient.view import link as view_link
@@ -39,6 +41,7 @@ from salient.view.commands import COMMANDS
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
 from salient.view.server import PAGES_MAX
+from salient.view.traffic_feed import TrafficFeed
 
 TWENTY = [
     *(f"DRIVE_STATUS.{name}" for name in ("time_us", "state", "fault", "voltage_saturated", "single_pulse", "cycle")),
@@ -667,7 +670,7 @@ def test_time_of_a_link_without_virtual_time_is_that_of_the_drive_also_after_a_r
 
     bus = Bus()
     monkeypatch.setattr(view_link, "open_bus", lambda address: bus)
-    link = view_link.Link("socketcan:can0", "saturating", 0, FrameStore())
+    link = view_link.Link("socketcan:can0", "saturating", 0, FrameStore(), TrafficFeed(Traffic(BitRates(1_000_000))))
 
     def receive(time_us, unix_s):
         """A frame without a time of the drive, and one with it."""

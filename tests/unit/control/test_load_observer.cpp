@@ -153,21 +153,6 @@ TEST(LoadObserver, reports_the_innovation_before_the_step_and_the_speed_correcti
     }
 }
 
-TEST(LoadObserver, an_innovation_corrects_half_within_half_a_count_and_beyond_it_whole) {
-    std::mt19937 random(3);
-    for (const unsigned bits : {8u, 10u, 17u, 31u}) {
-        const int32_t half = 1 << (31u - bits);
-        for (int k = 0; k < 2000; k++) {
-            const int64_t width = k % 2 == 0 ? 3 * int64_t(half) : int64_t(1) << 27;
-            const auto innovation = int32_t(int64_t(random()) % (2 * width) - width);
-            const double within = std::clamp(double(innovation), -double(half), double(half));
-            const int32_t correction = load_observer_correction(innovation, uint32_t(half));
-            EXPECT_EQ(correction, std::ceil(innovation - within / 2.0)) << innovation;
-            EXPECT_EQ(load_observer_correction(innovation, 0), innovation);
-        }
-    }
-}
-
 // Every term with its rounding, for any gains and estimates. A speed correction that saturates is within 16 LSB of the
 // end, which makes the rest of that sample uncertain.
 TEST(LoadObserver, a_step_rounds_its_terms_as_stated_and_its_sums_saturate) {

@@ -53,7 +53,7 @@ class Detector {
             moving_load_review(&parameters, &state, load_q24 + (high ? range_q24 : 0), hold);
         }
         const observer_bandwidth_sample_t sample = {
-            .correction = innovation,
+            .innovation = innovation,
             .from_edge = from_edge,
             .stage = beat ? OBSERVER_BANDWIDTH_BEAT_STAGE : OBSERVER_BANDWIDTH_STEADY_STAGE,
             .trigger = triggered ? OBSERVER_TRIGGER_IN_STEADY_STATE : OBSERVER_TRIGGER_NONE,

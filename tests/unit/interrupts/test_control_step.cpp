@@ -642,7 +642,7 @@ TEST_F(SalientControl, a_rotor_that_turns_at_the_start_is_no_load_although_its_c
         turns += speed_rad_s / (2.0 * fixed_point::PI * RATE_HZ);
         sample.encoder.counts = uint32_t(std::floor((turns - std::floor(turns)) * (1 << BITS)));
         step_as_sampled();
-        ASSERT_LT(fixed_abs(state.observer.load_torque_q24), 15 << 24) << k;
+        ASSERT_LT(fixed_abs(state.observer.load_torque_q24), 12 << 24) << k;
     }
     EXPECT_EQ(state.state_machine.state, DRIVE_STATE_READY);
     EXPECT_NEAR(state.observer.speed_q22 / 4194304.0, speed_rad_s, 0.5 * speed_rad_s);

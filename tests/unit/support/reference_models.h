@@ -67,11 +67,6 @@ struct observer_t {
         return difference - std::round(difference);
     }
 
-    // What is within half a count corrects half.
-    static double correction(double innovation, double half_count) {
-        return innovation - std::clamp(innovation, -half_count, half_count) / 2.0;
-    }
-
     // speed_unit_rad_s: unit of the speed, and with that of the torque of inertia and friction.
     static observer_t ideal(double bandwidth_rad_s, double rate_hz, double inertia_kg_m2, double friction_Nm_s,
                             double speed_unit_rad_s = 1.0) {
@@ -88,8 +83,8 @@ struct observer_t {
         return observer;
     }
 
-    void step(double measured_rev, double torque, double half_count = 0.0) {
-        const double error = correction(std::clamp(innovation(measured_rev), -1.0 / 32.0, 1.0 / 32.0), half_count);
+    void step(double measured_rev, double torque) {
+        const double error = std::clamp(innovation(measured_rev), -1.0 / 32.0, 1.0 / 32.0);
         angle += angle_gain * error;
         speed_correction = speed_gain * error;
         const double corrected = speed + speed_correction;

@@ -150,7 +150,6 @@ class salient_t {
             seen.table_Wb[phase] = machine.flux(angle[phase], current);
             torque += machine.torque(angle[phase], current);
         }
-        const double half_count = from_edge ? 0.0 : std::ldexp(0.5, -int(encoder_bits));
         const double innovation = observer.innovation(measured);
         const unsigned triggers = bandwidth.triggers;
         const double now_rad_s = bandwidth.step(innovation, from_edge, least_rad_s, beat);
@@ -159,12 +158,11 @@ class salient_t {
         const double rounding = from_edge ? 0.0 : rounding_counts(counts, moving_load[0].time_constant_s * rate_hz);
         // These act in the next period.
         beat = rounding >= 1.0 / 24.0 && counts >= 0.5;
-        const double correction = reference_model::observer_t::correction(innovation, half_count);
-        const unsigned withheld = moving_load[from_edge].step(correction, std::ldexp(rounding, -int(encoder_bits)),
+        const unsigned withheld = moving_load[from_edge].step(innovation, std::ldexp(rounding, -int(encoder_bits)),
                                                               bandwidth.triggers > triggers, narrow);
         least_rad_s = withheld > 0 ? stage_rad_s[OBSERVER_BANDWIDTH_STAGES - 1 - withheld] : 0.0;
         observer.set_gains(observer_of(now_rad_s));
-        observer.step(measured, torque, half_count);
+        observer.step(measured, torque);
         if (!run) {
             reaching = 0.0;
             return {-1.0, -1.0, -1.0, -1.0};

@@ -20,7 +20,8 @@ from salient.bus.signals import drive_database
 from salient.config import DEFAULTS
 from salient.dbc import database_hash
 from salient.errors import RunFailed, UsageError
-from salient.machine.cache import kept_machines, machine_hash
+from salient.machine.cache import kept_machines
+from salient.machine.content import machine_hash
 from salient.machine.file import MachineError, machine_path
 from salient.paths import EXAMPLE_MACHINES, MACHINES
 

@@ -9,10 +9,7 @@ kept, under the hash of the drive's DBC, which a drive sends: its frames can be 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import tomllib
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -21,25 +18,24 @@ from typing import Any
 from salient.config import DEFAULTS, BenchConfig
 from salient.errors import UsageError, close_names
 from salient.guard import removes
+from salient.machine.content import content_of, map_of
 from salient.machine.path import MachineError, machine_path, stated_conditions
 from salient.paths import BUILD, DRIVE_DBC, EXAMPLE_MACHINES, IS_WHEEL, MACHINES, PARAMETERS, PYTHON_PACKAGES
 
 FOLDER = BUILD / "machines"
 IMAGE_SUFFIX = ".machine"
 TABLES_SUFFIX, PLANT_SUFFIX = ".tables.c", ".plant.c"
-_BYTES_MAX = 30_000_000
-"""More than machine files and maps may have."""
 
 
 def machine_image(name_or_path: str) -> Path:
     """The image of a bundled machine or a machine file. UsageError: a mistake in the file, one line that names it."""
     try:
-        return files_by_content(machine_path(name_or_path))[0]
+        return files_bycontent_of(machine_path(name_or_path))[0]
     except MachineError as error:
         raise UsageError(str(error)) from None
 
 
-def files_by_content(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> list[Path]:
+def files_bycontent_of(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> list[Path]:
     """Files of these suffixes of a machine file; all are made at once (files_of of salient.machine.sources).
     MachineError: a mistake in the file; UsageError: they cannot be kept."""
     while True:
@@ -67,13 +63,13 @@ def _copy(path: Path) -> Mapping[str, bytes]:
     from salient.machine.file import load_machine
     from salient.machine.scaling import database_of, scaling_of
 
-    content = _content(path)
+    content = content_of(path)
     maps = map_of(path, content)
     if path.parent in (MACHINES, EXAMPLE_MACHINES) or any(file.parent != path.parent for file in maps):
         return {}
     machine = load_machine(path)
     folder = _copy_folder(database_hash(database_of(scaling_of(path, machine).dbc())))
-    return {**{f"{folder}/{file.name}": _content(file) for file in maps}, f"{folder}/{machine.name}.toml": content}
+    return {**{f"{folder}/{file.name}": content_of(file) for file in maps}, f"{folder}/{machine.name}.toml": content}
 
 
 def _copy_folder(dbc_hash: int) -> str:
@@ -105,52 +101,11 @@ def bench_config(given: Mapping[str, Any]) -> BenchConfig:
 def content_key(path: Path) -> str:
     """Hash of a machine file, of the map that it names, and of the generator. A file that cannot be used has one too:
     loading it reports the mistake."""
-    machine = _content(path)
+    machine = content_of(path)
     digest = hashlib.sha256(_generator())
-    for content in (machine, *map(_content, map_of(path, machine))):
+    for content in (machine, *map(content_of, map_of(path, machine))):
         digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()[:32]
-
-
-def machine_hash(path: Path) -> int:
-    """CRC-32 of the values of a machine file, whatever their order, comments and layout, and of its map as it is: what
-    DRIVE_MACHINE reports. MachineError: not a file of TOML."""
-    content = _content(path)
-    try:
-        values = tomllib.loads(content.decode("utf-8-sig"))
-        text = json.dumps(_normal(values), sort_keys=True, separators=(",", ":"), default=str)
-    except (ValueError, RecursionError) as error:
-        raise MachineError(f"{path}: {error}") from None
-    crc = zlib.crc32(text.encode())
-    for file in map_of(path, content):
-        crc = zlib.crc32(_content(file), crc)
-    return crc
-
-
-def _normal(value: Any) -> Any:
-    """A value of a TOML file in which 1 and 1.0 are the same."""
-    if isinstance(value, dict):
-        return {key: _normal(element) for key, element in value.items()}
-    if isinstance(value, list):
-        return [_normal(element) for element in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def map_of(path: Path, machine: bytes) -> list[Path]:
-    """The flux-linkage map that a machine file of this content names; none in one that is no machine file."""
-    try:
-        return [path.parent / tomllib.loads(machine.decode("utf-8-sig"))["magnetics"]["file"]]
-    except (ValueError, RecursionError, KeyError, TypeError):
-        return []
-
-
-def _content(path: Path) -> bytes:
-    try:
-        if path.is_file() and path.stat().st_size <= _BYTES_MAX:
-            return path.read_bytes()
-    except OSError:
-        pass
-    return b"none"
 
 
 @lru_cache

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from salient.dbc import database_hash
-from salient.machine.cache import machine_hash
+from salient.machine.content import machine_hash
 from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal
 from salient.machine.firmware_tables import (
     ANGLE_BINS,
