@@ -103,7 +103,8 @@ def supply_V(path: Path) -> float:
 def watch(can: str, machine: str | None) -> int:
     """`tools/salient monitor` for 0.2 s; its exit code."""
     stated = [] if machine is None else ["--machine", machine]
-    return monitor(make_parser().parse_args(["monitor", "--can", can, "--every-s", "0.05", "--duration-s", "0.2", *stated]))
+    arguments = ["monitor", "--can", can, "--every-s", "0.05", "--duration-s", "0.2", *stated]
+    return monitor(make_parser().parse_args(arguments))
 
 
 @pytest.mark.in_turns

@@ -129,7 +129,8 @@ def similar(machine: Machine, a: int, v: int) -> Machine:
 def in_no_unit(machine: Machine, scaling: Scaling) -> str:
     """The source of the firmware's tables but for what states the units."""
     tables = firmware_tables(MACHINES / "saturating.toml", machine, scaling)
-    return re.sub(r"\.(parameter_fraction_bits|dbc_hash|machine_hash) = [^.]*", "", tables_source(machine, scaling, tables))
+    return re.sub(r"\.(parameter_fraction_bits|dbc_hash|machine_hash) = [^.]*", "",
+                  tables_source(machine, scaling, tables))
 
 
 @pytest.mark.in_turns

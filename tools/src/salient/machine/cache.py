@@ -30,12 +30,12 @@ TABLES_SUFFIX, PLANT_SUFFIX = ".tables.c", ".plant.c"
 def machine_image(name_or_path: str) -> Path:
     """The image of a bundled machine or a machine file. UsageError: a mistake in the file, one line that names it."""
     try:
-        return files_bycontent_of(machine_path(name_or_path))[0]
+        return files_by_content(machine_path(name_or_path))[0]
     except MachineError as error:
         raise UsageError(str(error)) from None
 
 
-def files_bycontent_of(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> list[Path]:
+def files_by_content(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> list[Path]:
     """Files of these suffixes of a machine file; all are made at once (files_of of salient.machine.sources).
     MachineError: a mistake in the file; UsageError: they cannot be kept."""
     while True:
