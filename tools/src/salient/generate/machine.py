@@ -12,7 +12,8 @@ from pathlib import Path
 
 from salient.errors import UsageError
 from salient.generate.files import write_files
-from salient.machine.cache import IMAGE_SUFFIX, PLANT_SUFFIX, TABLES_SUFFIX, files_by_content, map_of
+from salient.machine.cache import IMAGE_SUFFIX, PLANT_SUFFIX, TABLES_SUFFIX, files_by_content
+from salient.machine.content import map_of
 from salient.machine.path import MachineError
 from salient.paths import DRIVE_DBC, PARAMETERS
 
