@@ -109,7 +109,7 @@ TEST(FluxMonitor, a_current_that_one_phase_lacks_and_another_has_is_a_sensor_s) 
     EXPECT_EQ(flux_monitor_verdict(&evidence, 2), FAULT_CURRENT_SENSOR);
 }
 
-// What a run leaves in the monitor, and samples in which the drive is at rest.
+// State that a run leaves in the monitor, and samples in which the drive is at rest.
 class FluxMonitorState : public testing::Test {
   protected:
     uint32_t step(bool run) {

@@ -18,7 +18,7 @@ from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.arming import response_to
 from salient.bus import e2e
-from salient.bus.signals import drive_database, rig_database
+from salient.bus.signals import FrameKey, drive_database, frame_key, rig_database
 from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table, value_name
 from salient.machine.scaling import Exponents, scaling_of
@@ -38,8 +38,6 @@ _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
 _SILENT_PERIODS = 3
 """Of the commands, after which they have ceased."""
-
-_Key = tuple[int, bool]
 
 
 @dataclass(slots=True)
@@ -93,14 +91,14 @@ def last_before(found: Sequence[Stimulus], time_s: float) -> Stimulus | None:
     return next((stimulus for stimulus in reversed(found) if stimulus.time_s <= time_s), None)
 
 
-def act_frames(machine: str | None, nodes: Sequence[int]) -> dict[_Key, Message]:
+def act_frames(machine: str | None, nodes: Sequence[int]) -> dict[FrameKey, Message]:
     """The messages that `stimuli` reads, by identifier and whether it has 29 bits."""
     return {key: message for sender in (_HOST, "DRIVE", "RIG")
             for key, message in _messages_from(sender, machine, nodes).items()
             if message.name not in _ONLY_TIME and (sender == _HOST or message.name in _ANSWERS)}
 
 
-def _key(frame: can.Message) -> _Key:
+def _key(frame: can.Message) -> FrameKey:
     return frame.arbitration_id, frame.is_extended_id
 
 
@@ -108,8 +106,8 @@ def _content(frame: can.Message) -> tuple[int, bool, bool, bool, bytes]:
     return frame.arbitration_id, frame.is_extended_id, frame.is_remote_frame, frame.is_fd, bytes(frame.data)
 
 
-def _messages_from(sender: str, machine: str | None, nodes: Sequence[int]) -> dict[_Key, Message]:
-    return {(message.frame_id, message.is_extended_frame): message for node in nodes
+def _messages_from(sender: str, machine: str | None, nodes: Sequence[int]) -> dict[FrameKey, Message]:
+    return {frame_key(message): message for node in nodes
             for database in (drive_database(machine, node), rig_database(node)) for message in database.messages
             if sender in message.senders}
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cantools
 from cantools.database.can import Database, Message
 
-from salient.bus.signals import big_endian_bit, drive_database, rig_database
+from salient.bus.signals import FrameKey, big_endian_bit, drive_database, frame_key, rig_database
 from salient.errors import UsageError, shown
 
 OPTION = "--dbc"
@@ -27,12 +28,12 @@ def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]
     where the file names none (`node_of`). UsageError, a line that begins with the option: a file cannot be read or is
     no DBC; it defines no message, or an identifier twice, or one that another database defines, the drive's included.
     """
-    owners: dict[tuple[int, bool], tuple[str, str]] = {}
+    owners: dict[FrameKey, tuple[str, str]] = {}
     names: set[str] = set()
     for database, owner in ((drive_database(None, node), f"the drive with node number {node} (--node)"),
                             (rig_database(node), "its test bench")):
         for message in database.messages:
-            owners[_key(message)] = owner, message.name
+            owners[frame_key(message)] = owner, message.name
             names.add(message.name)
     reserved = {sender for database in (drive_database(None), rig_database()) for message in database.messages
                 for sender in message.senders}
@@ -40,10 +41,10 @@ def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]
     for path in paths:
         database = _load(path)
         for message in database.messages:
-            owner, other = owners.setdefault(_key(message), (str(path), message.name))
+            owner, other = owners.setdefault(frame_key(message), (str(path), message.name))
             if (owner, other) != (str(path), message.name):
                 raise UsageError(f"{OPTION} {path}: {message.name} has the identifier "
-                                 f"{identifier_text(*_key(message))} of {other} of {owner}")
+                                 f"{identifier_text(*frame_key(message))} of {other} of {owner}")
         label = re.sub(r"\W", "_", path.stem)
         _name_messages(database, path, label, names, reserved)
         loaded.append(database)
@@ -58,10 +59,6 @@ def node_of(message: Message) -> str:
 def identifier_text(identifier: int, is_extended: bool) -> str:
     """An identifier in hexadecimal digits, as many as it may have."""
     return f"{identifier:0{8 if is_extended else 3}X}"
-
-
-def _key(message: Message) -> tuple[int, bool]:
-    return message.frame_id, message.is_extended_frame
 
 
 def _load(path: Path) -> Database:
@@ -82,11 +79,11 @@ def _load(path: Path) -> Database:
     assert isinstance(database, Database)
     if not database.messages:
         raise UsageError(f"{OPTION} {path}: no valid DBC: it defines no message")
-    identifiers = [_key(message) for message in database.messages]
+    occurrences = Counter(map(frame_key, database.messages))
     for message in database.messages:
-        if identifiers.count(_key(message)) > 1:
+        if occurrences[frame_key(message)] > 1:
             raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name} has the identifier "
-                             f"{identifier_text(*_key(message))} of another message of the file")
+                             f"{identifier_text(*frame_key(message))} of another message of the file")
         _check(path, message)
     return database
 
@@ -119,7 +116,7 @@ def _name_messages(database: Database, path: Path, label: str, names: set[str], 
         if message.name in names:
             message.name = f"{label}:{message.name}"
         if message.name in names:
-            message.name = f"{message.name}_{identifier_text(*_key(message))}"
+            message.name = f"{message.name}_{identifier_text(*frame_key(message))}"
         names.add(message.name)
     if not any(message.senders for message in database.messages):
         print(f"salient: {OPTION} {path}: names no node that sends: its messages are those of {label}",

@@ -147,7 +147,7 @@ class Carrier:
             self._tell_apart(drive, reported, self._carried)
 
     def _tell_apart(self, drive: str, reported: int, carried: int) -> None:
-        """The machine among those of the same DBC; a line when it is none that is known, or not the stated one."""
+        """Finds the machine among those of the same DBC; one line when it is unknown, or another than stated."""
         same = _same(reported, carried, self._noted)
         if self._given is None and same is not None:
             self.machine = same

@@ -15,6 +15,7 @@ from salient.bus.clock import nodes_of_messages
 from salient.bus.databases import messages_of
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_input import Damage, LogInput
+from salient.bus.signals import frame_key
 from salient.bus.text_logs import Frames, nanoseconds, read_text
 from salient.config import READABLE_SUFFIXES, Rotation, either
 from salient.errors import RunFailed, UsageError
@@ -37,8 +38,7 @@ class KnownFrames:
 
     def __init__(self, node: int | None, others: Sequence[Database] = ()) -> None:
         self._node = node
-        self._lengths = {(message.frame_id, message.is_extended_frame): message.length for message in
-                         messages_of(others)}
+        self._lengths = {frame_key(message): message.length for message in messages_of(others)}
         self._others: set[int] = set()
         self._count = 0
         self.found = False

@@ -20,7 +20,7 @@ from salient.bus.interface import closed_in_order
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_reader import read_log
 from salient.bus.selected_signals import SelectedSignals
-from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.bus.signals import SignalTable, drive_database, frame_key, rig_database
 from salient.bus.traffic import Traffic
 from salient.bus.traffic_text import event_line, load_text, report_lines
 from salient.config import Rotation
@@ -131,6 +131,12 @@ def _write(line: str) -> None:
     sys.stdout.flush()
 
 
+def _tell_events(traffic: Traffic) -> None:
+    """Prints what has gone missing and what is back."""
+    for event in traffic.take_events():
+        _write(event_line(event))
+
+
 class _Lines:
     """What a monitor prints: signals, and the traffic of the bus where that is wanted."""
 
@@ -158,12 +164,7 @@ class _Lines:
         self._shown.add(time_ns, message)
         if self.traffic is not None:
             self.traffic.add(time_ns, message)
-            self.tell_events()
-
-    def tell_events(self) -> None:
-        """Prints what has gone missing and what is back."""
-        for event in self.traffic.take_events() if self.traffic is not None else ():
-            _write(event_line(event))
+            _tell_events(self.traffic)
 
     def line(self, time_ns: int) -> str:
         """The values at a time; empty when there are none."""
@@ -178,7 +179,7 @@ class _Lines:
     def finish(self) -> None:
         """The table of all messages."""
         if self.traffic is not None and self.traffic.first_ns is not None:
-            self.tell_events()
+            _tell_events(self.traffic)
             _write("\n".join(report_lines(self.traffic.total())))
 
 
@@ -214,7 +215,7 @@ class _Nodes:
         self._address = address
         self._wanted = wanted
         self._heard: set[int] = set()
-        self._of_files = {(message.frame_id, message.is_extended_frame) for message in messages_of(others)}
+        self._of_files = set(map(frame_key, messages_of(others)))
         self._others_heard = False
         self._traffic = traffic
         self._from_ns: int | None = None
@@ -254,8 +255,7 @@ class _Nodes:
             self.tell_absence()
         if self._traffic is not None and last_ns is not None:
             self._traffic.advance(last_ns + round(silent_s * 1e9))
-            for event in self._traffic.take_events():
-                _write(event_line(event))
+            _tell_events(self._traffic)
 
     def watch(self, frames: Iterator[tuple[int, can.Message]]) -> Iterator[tuple[int, can.Message]]:
         """The frames, each of which is taken."""

@@ -20,6 +20,7 @@ from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import database_of, scaling_of
 from salient.paths import DRIVE_DBC, RIG_DBC
 
+FrameKey = tuple[int, bool]
 _TIME_BYTES, _WORD_BYTES = 8, 8
 
 
@@ -142,12 +143,12 @@ class SignalTable(Mapping[str, Signal]):
     def decode_with(self, database: Database) -> None:
         """Decodes by another database from here on, what there is already as well: that of another machine, which has
         the same messages with other factors."""
-        self._messages: dict[tuple[int, bool], Message] = {}
-        self._names: dict[str, tuple[tuple[int, bool], cantools.database.can.Signal]] = {}
+        self._messages: dict[FrameKey, Message] = {}
+        self._names: dict[str, tuple[FrameKey, cantools.database.can.Signal]] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
             if self._sender is not None and self._sender not in message.senders:
                 continue
-            key = (message.frame_id, message.is_extended_frame)
+            key = frame_key(message)
             self._messages[key] = message
             for signal in message.signals:
                 self._names.setdefault(signal.name, (key, signal))
@@ -249,6 +250,11 @@ class BusSignals(SignalTable):
         self._data[key] += message.data[: self._width[key]].ljust(self._width[key], b"\0")
         self.frames += 1
         self.memory_bytes += _TIME_BYTES + self._width[key]
+
+
+def frame_key(message: Message) -> FrameKey:
+    """What tells the frames of a message of a database: identifier, and whether it is extended."""
+    return message.frame_id, message.is_extended_frame
 
 
 def names_of_values(signal: cantools.database.can.Signal) -> dict[float, str] | None:

@@ -13,12 +13,12 @@ from cantools.database.can import Database, Message
 
 from salient.bus.databases import identifier_text, node_of
 from salient.bus.frame_bits import BitRates
-from salient.bus.signals import drive_database, rig_database
+from salient.bus.signals import FrameKey, drive_database, frame_key, rig_database
 from salient.config import NODE_MAX
 from salient.dbc import attributes
 
 MISSING_CYCLES = 2.5
-"""After as many cycles without it a message is missing: a single lost frame is none, and it is told within three."""
+"""After as many cycles without it a message is missing: one lost frame is not enough, three cycles always are."""
 _UNKNOWN_MAX = 4096
 """Identifiers that no database defines, of which each is counted; of the further ones only all together."""
 _EVENTS_MAX = 1000
@@ -34,8 +34,6 @@ _DRIVE = "DRIVE"
 _IF_ACTIVE = "ifactive"
 _NOT_CYCLIC = ("onchange", "onwrite", "triggered", "event", "spontan")
 """Parts of send types (GenMsgSendType) with which a message may pause; the latter, where it is not cyclic as well."""
-
-Key = tuple[int, bool]
 
 
 @dataclass(frozen=True)
@@ -166,14 +164,14 @@ class Traffic:
         self._rates = rates
         self._known = known_messages(node, databases)
         self._off_bus = _rig_identifiers()
-        self._entries: dict[Key, _Entry] = {}
-        self._by_node: dict[str, dict[Key, _Entry]] = {}
+        self._entries: dict[FrameKey, _Entry] = {}
+        self._by_node: dict[str, dict[FrameKey, _Entry]] = {}
         for key, definition in sorted(self._known.items()):
             if definition.is_of_file or definition.node == _DRIVE:
                 self._new_entry(key)
-        self._unknown: dict[Key, _Entry] = {}
+        self._unknown: dict[FrameKey, _Entry] = {}
         self._further_unknown = 0
-        self._due: list[tuple[float, Key]] = []
+        self._due: list[tuple[float, FrameKey]] = []
         self._events: deque[Event] = deque(maxlen=_EVENTS_MAX)
         self._silent: set[str] = set()
         self.first_ns: int | None = None
@@ -217,7 +215,7 @@ class Traffic:
             self._slot, self._slot_ns = slot, 0.0
         self._slot_ns += busy_ns
 
-    def _new_entry(self, key: Key) -> _Entry | None:
+    def _new_entry(self, key: FrameKey) -> _Entry | None:
         """The entry of an identifier that comes for the first time; None for an unknown one beyond the limit."""
         definition = self._known.get(key)
         if definition is not None:
@@ -229,7 +227,7 @@ class Traffic:
             known = self._unknown[key] = _Entry(None)
         return known
 
-    def _take(self, entry: _Entry, key: Key, time_ns: int, length: int) -> None:
+    def _take(self, entry: _Entry, key: FrameKey, time_ns: int, length: int) -> None:
         definition = entry.definition
         if definition is not None and length != definition.length and (
                 length < definition.length or not definition.is_of_file):
@@ -338,14 +336,14 @@ class Traffic:
 
     @staticmethod
     def _is_shown(entry: _Entry, of_node: Iterable[_Entry]) -> bool:
-        """Whether it has come, or should have; without a frame of the drive there is none."""
+        """Whether it has come, or should have; the messages of a drive only once it has been heard."""
         definition = entry.definition
         if entry.frames or definition is None:
             return True
         return (entry.expected_ns > 0 and not definition.pauses
                 and (definition.is_of_file or any(each.frames for each in of_node)))
 
-    def _message(self, key: Key, entry: _Entry, duration_ns: int, is_total: bool) -> MessageReport:
+    def _message(self, key: FrameKey, entry: _Entry, duration_ns: int, is_total: bool) -> MessageReport:
         before = (0, 0, 0, 0.0) if is_total else entry.before
         intervals, sum_ns = entry.intervals - before[1], entry.sum_ns - before[2]
         if not intervals:
@@ -359,22 +357,22 @@ class Traffic:
             _part(entry.busy_ns - before[3], duration_ns))
 
 
-def known_messages(node: int, databases: Iterable[Database]) -> dict[Key, Definition]:
+def known_messages(node: int, databases: Iterable[Database]) -> dict[FrameKey, Definition]:
     """The messages of the bus: of all node numbers of drives, that with `node` without it in its name, and of databases
     of other nodes, which come before them."""
-    found: dict[Key, Definition] = {}
+    found: dict[FrameKey, Definition] = {}
     for number in sorted(range(NODE_MAX + 1), key=lambda each: each == node):
         of_node = "" if number == node else f" (node {number})"
         for message in drive_database(None, number).messages:
-            found[_key(message)] = _definition(message, f"{message.senders[0]}{of_node}", is_of_file=False)
+            found[frame_key(message)] = _definition(message, f"{message.senders[0]}{of_node}", is_of_file=False)
     for database in databases:
         for message in database.messages:
-            found[_key(message)] = _definition(message, node_of(message), is_of_file=True)
+            found[frame_key(message)] = _definition(message, node_of(message), is_of_file=True)
     return found
 
 
-def _rig_identifiers() -> frozenset[Key]:
-    return frozenset(_key(message) for node in range(NODE_MAX + 1) for message in rig_database(node).messages)
+def _rig_identifiers() -> frozenset[FrameKey]:
+    return frozenset(frame_key(message) for node in range(NODE_MAX + 1) for message in rig_database(node).messages)
 
 
 def _definition(message: Message, node: str, *, is_of_file: bool) -> Definition:
@@ -385,8 +383,6 @@ def _definition(message: Message, node: str, *, is_of_file: bool) -> Definition:
     return Definition(node, message.name, message.length, cycle_ns, pauses, settable, is_of_file)
 
 
-def _key(message: Message) -> Key:
-    return message.frame_id, message.is_extended_frame
 
 
 def _part(busy_ns: float, duration_ns: int) -> float:

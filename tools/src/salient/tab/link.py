@@ -11,6 +11,7 @@ import can
 
 from salient.bench.bench import Bench
 from salient.bus.interface import CAN_EFF_FLAG
+from salient.bus.signals import frame_key
 from salient.config import DEFAULTS
 from salient.machine.path import machine_path
 from salient.paths import IS_WHEEL, MACHINES, OUT
@@ -64,7 +65,7 @@ def _is_classic(message: can.Message) -> bool:
 
 def _others_sent(bench: Bench) -> bool:
     """True when the log has frames of a client that the bench is not."""
-    of_hosts = {(message.frame_id, message.is_extended_frame)
+    of_hosts = {frame_key(message)
                 for database in (bench.drive_database, bench.rig_database) for message in database.messages
                 if "HOST" in message.senders and message.name != "RIG_RUN_UNTIL"}
     seen = Counter(_key(message) for _, message in bench.log
