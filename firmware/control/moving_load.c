@@ -1,6 +1,5 @@
 #include "control/moving_load.h"
 
-#include "control/machine_tables.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -11,29 +10,16 @@
 #define HOLD_MS 25
 #define HOLDS_MAX 32
 #define RELEASE_MS 5
-#define STILL_MS 500
 
 /* Ratios p / q up to this q: the trend of the next ones is below 1/14 count. */
 #define ROUNDING_RATIOS 6u
-
-#define HALF_PI_Q7 201
 
 /* 2^-32 rev, Q28.4: 0.3 urad, what an ideal encoder leaves (observer_bandwidth.c), and 0.7 urad. */
 #define THRESHOLD_IDEAL_Q4 3281
 #define THRESHOLD_EDGE_Q4 7656
 
-/* Low-pass of the estimate, 2^6 reviews: 6 ms at 40 kHz. */
-#define LOAD_SHIFT 6
-
-/* J w^2 count / 32 + T / 64. */
-static int32_t movement_min_q24(const moving_load_settings_t *settings) {
-    const int64_t stiffness_q30 =
-        (int64_t)settings->bandwidth_rad_s * settings->bandwidth_rad_s * settings->inertia_q30;
-    /* A count is 2 pi 2^-encoder_bits; pi / 2 in Q1.7 of the inertia's Q1.30 cut to Q18. */
-    const int64_t noise_q24 =
-        (stiffness_q30 >> 12) * HALF_PI_Q7 >> (4u + settings->encoder_bits + machine_tables.speed_exponent);
-    return fixed_saturate(noise_q24 + settings->torque_max_q24 / 64);
-}
+/* By which a trend widens the bandwidth: to (16 / 13)^4 = 2.3 times. */
+#define WIDENING_STAGES 4u
 
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings) {
     const unsigned encoder_shift = 32u - settings->encoder_bits;
@@ -48,34 +34,27 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
         .hold_ticks_max = ticks_per_ms * HOLD_MS * HOLDS_MAX,
         .release_ticks = ticks_per_ms * RELEASE_MS,
         .settling_ticks = settings->trigger_ticks + SETTLING_TIME_CONSTANTS * time_constant,
-        .still_reviews = ticks_per_ms * STILL_MS / settings->periods_per_review,
-        .movement_min_q24 = movement_min_q24(settings),
         .stages = settings->stages,
     };
 }
 
-/* A load that has been still long enough for a trend to be ripple: 156 ms or 0.5 s. */
-static bool still(const moving_load_parameters_t *parameters, const moving_load_t *moving) {
-    const uint32_t reviews = parameters->still_reviews;
-    return moving->still >= (moving->source == MOVING_LOAD_SOURCE_UNMODELLED ? reviews : reviews * 5 / 16);
+/* Stages that a trend withholds, at the present stage. */
+static uint32_t stages_of_trend(const moving_load_parameters_t *parameters, unsigned stage) {
+    const uint32_t wider = stage == OBSERVER_BANDWIDTH_BEAT_STAGE ? 1u : WIDENING_STAGES;
+    return fixed_min_u32(parameters->stages, OBSERVER_BANDWIDTH_BEAT_STAGE - stage + wider);
 }
 
 /* A trend soon after the release of the first of these stages doubles the hold. */
 static void withhold(const moving_load_parameters_t *parameters, moving_load_t *moving, uint32_t stages) {
     uint32_t hold_ticks = moving->hold_ticks;
     if (moving->withheld < stages) {
-        moving->first = hold_ticks == 0;
-        hold_ticks *= 2;
-        if (still(parameters, moving) && hold_ticks > parameters->hold_ticks_min) {
-            if (moving->source == MOVING_LOAD_SOURCE_RIPPLE) {
-                moving->source = MOVING_LOAD_SOURCE_UNMODELLED;
-                moving->still = 0;
-            } else {
-                moving->source = MOVING_LOAD_SOURCE_RIPPLE;
-            }
+        moving->settling = parameters->time_constant;
+        if (moving->withheld == 0 || moving->releasing) {
+            moving->first = hold_ticks == 0;
+            hold_ticks *= 2;
         }
-        moving->settling = parameters->release_ticks;
     }
+    moving->releasing = false;
     moving->hold_ticks = (uint32_t)fixed_clamp((int32_t)hold_ticks, (int32_t)parameters->hold_ticks_min,
                                                (int32_t)parameters->hold_ticks_max);
     moving->withheld = fixed_max_u32(moving->withheld, stages);
@@ -115,48 +94,22 @@ uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_loa
     const int32_t trend_q4 = (int32_t)(moving->trend_q36 >> 32);
     moving->trend_q36 =
         fixed_accumulate(moving->trend_q36, fixed_subtract(sample->innovation * 16, trend_q4), parameters->gain_q32);
-    const uint32_t base_q4 = sample->from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
-    const uint32_t threshold_q4 = moving->source == MOVING_LOAD_SOURCE_RIPPLE ? base_q4 * 5 / 2 : base_q4;
-    const uint32_t magnitude_q4 = fixed_magnitude(trend_q4);
+    const uint32_t threshold_q4 = sample->from_edge ? THRESHOLD_EDGE_Q4 : parameters->threshold_count_q4 + rounding_q4;
     if (sample->trigger != OBSERVER_TRIGGER_NONE) {
         begin_settling(parameters, moving);
     }
     moving->settling -= moving->settling > 0;
-    if (moving->settling == 0 && magnitude_q4 > threshold_q4) {
-        withhold(parameters, moving, sample->stage == OBSERVER_BANDWIDTH_BEAT_STAGE ? 1 : parameters->stages);
+    if (moving->settling == 0 && fixed_magnitude(trend_q4) > threshold_q4) {
+        withhold(parameters, moving, stages_of_trend(parameters, sample->stage));
     } else if (moving->ticks > 0) {
         moving->ticks -= !hold;
     } else if (moving->withheld > 0) {
         moving->withheld--;
+        moving->releasing = true;
         moving->ticks = moving->withheld > 0 ? parameters->release_ticks : moving->hold_ticks;
     } else {
         moving->hold_ticks /= 2;
         moving->ticks = moving->hold_ticks;
     }
     return moving->withheld;
-}
-
-void moving_load_review(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t load_torque_q24,
-                        bool hold) {
-    const int32_t load_q24 = moving->load_q24 + (fixed_subtract(load_torque_q24, moving->load_q24) >> LOAD_SHIFT);
-    moving->load_q24 = load_q24;
-    moving->load_min_q24 = fixed_min(load_q24, moving->load_min_q24);
-    moving->load_max_q24 = fixed_max(load_q24, moving->load_max_q24);
-    if (fixed_subtract(moving->load_max_q24, moving->load_min_q24) >= parameters->movement_min_q24) {
-        moving->load_min_q24 = moving->load_max_q24 = load_q24;
-        moving->still = 0;
-        moving->source = MOVING_LOAD_SOURCE_LOAD;
-        return;
-    }
-    moving->still += moving->still < parameters->still_reviews;
-    if (!still(parameters, moving) || hold) {
-        return;
-    }
-    const uint32_t held_ticks = moving->hold_ticks - moving->ticks;
-    if (moving->withheld == parameters->stages && held_ticks >= parameters->hold_ticks_min && moving->ticks > 0) {
-        moving->ticks = 0;
-        moving->source = MOVING_LOAD_SOURCE_RIPPLE;
-    } else if (moving->withheld == 0 && moving->hold_ticks > parameters->hold_ticks_min) {
-        moving->hold_ticks = moving->ticks = parameters->hold_ticks_min;
-    }
 }

@@ -11,15 +11,12 @@
  *
  *   trend += (innovation - trend) Ts / 1.6 ms
  *
- * The ripple of the drive itself has a trend as well, which a light rotor or a slow one shows. The wide bandwidth then
- * only adds noise, of J w0^2 count / 4 to the estimate, and ripple. The load has moved when the range of the estimate
- * since the last movement, after a low-pass of 6 ms, exceeds 1/8 of that noise and 1/64 of the largest torque together.
- * While it has not for 156 ms, longer than the crest of a sine of 1 Hz takes, a longer hold than 25 ms is cut
- * short. A trend after that or soon after a release is ripple, with 2.5 times the threshold until the load moves: what
- * has been learned while it moved is less exact than what will be while it does not. A larger trend is more than
- * ripple, such as that of a misalignment which is still to be learned: then the base threshold and the long holds
- * return for 0.5 s, as often as that happens. More than that factor would let the innovation reach the count at
- * which observer_bandwidth.h takes it for a load step.
+ * A trend above its threshold withholds the last stages of the bandwidth's decay: four more than the present one, at
+ * 2.3 times its bandwidth, and again each time constant until the trend is gone. So the bandwidth is as wide as the
+ * load needs, whose rate may grow by (16/13)^12 = 12 times with each of these steps, and no wider: the ripple of the
+ * drive itself has a trend as well, of an error T of the torque about T / (J w0^2), and the widest bandwidth would turn
+ * it into noise of J w0^2 count of the torque. Steps of one or two stages follow a load ramp too late, steps of more
+ * than five answer ripple with four times the noise (compare ramps, ripple).
  *
  * Rounding to counts has a trend of its own. While the rotor turns by r = p / q + d counts in a period, the errors of q
  * successive samples are spread evenly over a count, and their mean is a sawtooth of +-1 / (2 q) counts that repeats
@@ -28,16 +25,13 @@
  *
  *   rounding = max over q of 1 / (2 q) / (4 n + 1) counts,   n = |q r - p| T / Ts
  *
- * which is added to a threshold of 1/8 count, below which all q > 4 stay by themselves. A trend withholds the last
- * stages of the bandwidth's decay, so that the observer follows the load. They are released 25 ms after the last such
- * trend, one each 5 ms; when a trend interrupts the release, after twice the time before, up to 0.8 s. The value 1/8 is
- * found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a moving load, one of 1/5
- * makes the speed drop of a load ramp of 200 ms that of the paper's controller twice over.
+ * which is added to a threshold of 1/8 count, below which all q > 4 stay by themselves. The stages are released 25 ms
+ * after the last such trend, one each 5 ms; when a trend interrupts the release, after twice the time before, up to
+ * 0.8 s. The value 1/8 is found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a
+ * moving load, with one of 3/16 tables that are 5 % wrong make finite_element swing.
  *
- * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend: of
- * an error T the angle's is about T / (J w0^2). A trend in it withholds this stage alone; the load moves when there is
- * a trend in the steady stage as well. The wide bandwidth would pass the beat on to the torque. For 5 ms after the
- * bandwidth has widened no trend counts: it may still be that of the narrow one.
+ * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend. A
+ * trend in it withholds this stage alone; the load moves when there is a trend in the steady stage as well.
  *
  * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is none of
  * the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
@@ -59,17 +53,8 @@ typedef struct {
     uint32_t hold_ticks_max;     /* 0.8 s */
     uint32_t release_ticks;      /* 5 ms */
     uint32_t settling_ticks;     /* after a trigger */
-    uint32_t still_reviews;      /* 0.5 s */
-    int32_t movement_min_q24;    /* range of the load's estimate, N m, Q7.24 */
-    uint32_t stages;             /* to withhold; 0: no detection */
+    uint32_t stages;             /* to withhold, at most; 0: no detection */
 } moving_load_parameters_t;
-
-/* Source that a trend is attributed to. */
-typedef enum {
-    MOVING_LOAD_SOURCE_LOAD,       /* a load that has moved lately: base threshold */
-    MOVING_LOAD_SOURCE_RIPPLE,     /* ripple of the drive: 2.5 times the base threshold */
-    MOVING_LOAD_SOURCE_UNMODELLED, /* larger than ripple, of a load that does not move: base threshold */
-} moving_load_source_t;
 
 /* All zero at the start. */
 typedef struct {
@@ -78,11 +63,8 @@ typedef struct {
     uint32_t ticks;      /* until the next release */
     uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
     uint32_t withheld;   /* stages */
+    bool releasing;      /* no trend since a stage was released */
     bool first;          /* none had been withheld lately, and nothing has triggered since */
-    moving_load_source_t source;
-    uint32_t still;   /* reviews since the last movement, or since it is more than ripple, up to still_reviews */
-    int32_t load_q24; /* low-pass of the estimate, N m, Q7.24 */
-    int32_t load_min_q24, load_max_q24; /* its range since the last movement */
 } moving_load_t;
 
 /* All zero at the start. */
@@ -95,12 +77,8 @@ typedef struct {
 typedef struct {
     unsigned encoder_bits; /* 8..32 */
     uint32_t control_rate_hz;
-    uint32_t periods_per_review;
-    uint32_t stages;          /* to withhold */
-    uint32_t bandwidth_rad_s; /* of the observer then, from 100 */
-    uint32_t trigger_ticks;   /* end of the first stage after a trigger, periods */
-    int32_t inertia_q30;      /* kg m^2, Q1.30 */
-    int32_t torque_max_q24;   /* of the drive, N m, Q7.24 */
+    uint32_t stages;        /* to withhold, at most */
+    uint32_t trigger_ticks; /* end of the first stage after a trigger, periods */
 } moving_load_settings_t;
 
 moving_load_parameters_t moving_load_configure(const moving_load_settings_t *settings);
@@ -115,10 +93,5 @@ uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, mov
  * hold: what is withheld stays withheld. 64-bit product, rounded down. */
 uint32_t moving_load_step(const moving_load_parameters_t *parameters, moving_load_t *moving,
                           const observer_bandwidth_sample_t *sample, uint32_t rounding_q4, bool hold);
-
-/* Each periods_per_review: whether the load still moves, from the estimate of the observer in N m, Q7.24; hold: what is
- * withheld stays withheld. */
-void moving_load_review(const moving_load_parameters_t *parameters, moving_load_t *moving, int32_t load_torque_q24,
-                        bool hold);
 
 #endif

@@ -262,12 +262,8 @@ static void set_estimators(control_parameters_t *control, const configure_source
     control->moving_load = moving_load_configure(&(moving_load_settings_t){
         .encoder_bits = from->encoder_bits,
         .control_rate_hz = rate_hz,
-        .periods_per_review = DEFERRED_SLOW_PERIODS,
         .stages = OBSERVER_BANDWIDTH_STAGES - 1u - bandwidth->schedule.moving_stage,
-        .bandwidth_rad_s = moving->bandwidth_rad_s,
         .trigger_ticks = bandwidth->stage[bandwidth->schedule.trigger_stage_count].end_ticks,
-        .inertia_q30 = inertia_q30,
-        .torque_max_q24 = torque_max_q24,
     });
     /* With a transducer the whole load is fed forward already. */
     const bool learns_load =

@@ -204,12 +204,6 @@ static void follow_strokes(const control_parameters_t *parameters, deferred_t *d
     deferred->load_constant = constant && !deferred->periodic_load.engaged;
 }
 
-static void review_moving_load(const control_parameters_t *parameters, deferred_t *deferred,
-                               const deferred_input_t *input) {
-    moving_load_review(&parameters->moving_load, &deferred->moving_load, input->load_torque_q24,
-                       deferred->periodic_load.engaged);
-}
-
 static void learn_periodic_load(const control_parameters_t *parameters, deferred_t *deferred,
                                 const deferred_input_t *input) {
     if (deferred->mode != DRIVE_MODE_SPEED) {

@@ -18,16 +18,15 @@ typedef enum {
 enum {
     DATA_NONE = 0,
     DATA_STROKES = 1 << 0, /* stroke_mean, load_constant */
-    DATA_MOVING_LOAD = 1 << 1,
-    DATA_PERIODIC_LOAD = 1 << 2,
-    DATA_TORQUE_OFFSET = 1 << 3,
-    DATA_SPEED_LAW = 1 << 4, /* speed_smc */
-    DATA_MISALIGNMENT = 1 << 5,
-    DATA_APPROACH = 1 << 6, /* approached_q22, updates_since_near, approaches_reference */
-    DATA_MEAN_TORQUE = 1 << 7,
-    DATA_INERTIA = 1 << 8,
-    DATA_CONDUCTION = 1 << 9, /* conduction, conduction_update */
-    DATA_SLOW_COUNTS = 1 << 10,
+    DATA_PERIODIC_LOAD = 1 << 1,
+    DATA_TORQUE_OFFSET = 1 << 2,
+    DATA_SPEED_LAW = 1 << 3, /* speed_smc */
+    DATA_MISALIGNMENT = 1 << 4,
+    DATA_APPROACH = 1 << 5, /* approached_q22, updates_since_near, approaches_reference */
+    DATA_MEAN_TORQUE = 1 << 6,
+    DATA_INERTIA = 1 << 7,
+    DATA_CONDUCTION = 1 << 8, /* conduction, conduction_update */
+    DATA_SLOW_COUNTS = 1 << 9,
 };
 
 #endif

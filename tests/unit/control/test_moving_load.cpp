@@ -1,4 +1,5 @@
 // Trend of the innovation: detection of a load that moves.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -14,21 +15,14 @@ extern "C" {
 namespace {
 
 using namespace fixed_point;
-constexpr unsigned ENCODER_BITS = 17, STAGES = 9, PERIODS_PER_REVIEW = 4;
+constexpr unsigned ENCODER_BITS = 17, STAGES = 9, WIDENING = 4;
 constexpr int32_t COUNT = 1 << (32 - ENCODER_BITS);
 constexpr uint32_t RATE_HZ = 40000;
 constexpr uint32_t FAST = uint32_t(8.381966 * COUNT); // rotation per period, far from ratios
 constexpr uint32_t TRIGGER_TICKS = RATE_HZ / 500;
 
 moving_load_settings_t settings(unsigned encoder_bits = ENCODER_BITS, uint32_t rate_hz = RATE_HZ) {
-    return {.encoder_bits = encoder_bits,
-            .control_rate_hz = rate_hz,
-            .periods_per_review = PERIODS_PER_REVIEW,
-            .stages = STAGES,
-            .bandwidth_rad_s = 1700,
-            .trigger_ticks = TRIGGER_TICKS,
-            .inertia_q30 = to_fixed(0.02, Q30),
-            .torque_max_q24 = to_fixed(19.1, Q24)};
+    return {.encoder_bits = encoder_bits, .control_rate_hz = rate_hz, .stages = STAGES, .trigger_ticks = TRIGGER_TICKS};
 }
 
 // After six samples at a constant rotation per period.
@@ -48,14 +42,10 @@ class Detector {
 
     uint32_t step(int32_t innovation, uint32_t angle_step = FAST, bool from_edge = false, bool hold = false,
                   bool triggered = false, bool beat = false) {
-        if (++periods % PERIODS_PER_REVIEW == 0) {
-            const bool high = periods / (parameters.hold_ticks_min * 8 / 5) % 2 == 1; // for 40 ms
-            moving_load_review(&parameters, &state, load_q24 + (high ? range_q24 : 0), hold);
-        }
         const observer_bandwidth_sample_t sample = {
             .innovation = innovation,
             .from_edge = from_edge,
-            .stage = beat ? OBSERVER_BANDWIDTH_BEAT_STAGE : OBSERVER_BANDWIDTH_STEADY_STAGE,
+            .stage = OBSERVER_BANDWIDTH_BEAT_STAGE - (beat ? state.withheld : std::max(state.withheld, 1u)),
             .trigger = triggered ? OBSERVER_TRIGGER_IN_STEADY_STATE : OBSERVER_TRIGGER_NONE,
         };
         return moving_load_step(&parameters, &state, &sample,
@@ -73,22 +63,7 @@ class Detector {
     moving_load_parameters_t parameters;
     moving_load_t state{};
     moving_load_rounding_t rounding_state{};
-    int32_t load_q24 = 0;                    // estimate
-    int32_t range_q24 = to_fixed(10.0, Q24); // of its movements
-
-  private:
-    uint32_t periods = 0;
 };
-
-// A trend whenever stages are released: for that long something is withheld, as a part of the time.
-double withheld_part(Detector *detector, double time_s, int32_t innovation) {
-    const auto samples = uint32_t(time_s * RATE_HZ);
-    uint32_t withheld = 0;
-    for (uint32_t k = 0; k < samples; k++) {
-        withheld += detector->step(detector->state.withheld < STAGES ? innovation : 0) > 0;
-    }
-    return double(withheld) / samples;
-}
 
 TEST(MovingLoad, a_constant_innovation_of_a_seventh_of_a_count_withholds_and_of_a_ninth_does_not) {
     for (const int32_t sign : {1, -1}) {
@@ -99,7 +74,7 @@ TEST(MovingLoad, a_constant_innovation_of_a_seventh_of_a_count_withholds_and_of_
     }
 }
 
-TEST(MovingLoad, a_trend_in_the_stage_of_a_beat_withholds_it_and_one_5_ms_later_the_others) {
+TEST(MovingLoad, a_trend_in_the_stage_of_a_beat_withholds_it_and_one_1_6_ms_later_four_more) {
     Detector detector;
     uint32_t withheld = 0;
     while (withheld == 0) {
@@ -110,8 +85,32 @@ TEST(MovingLoad, a_trend_in_the_stage_of_a_beat_withholds_it_and_one_5_ms_later_
     while (detector.step(COUNT / 4) == 1) {
         periods++;
     }
+    EXPECT_EQ(detector.state.withheld, 1 + WIDENING);
+    EXPECT_NEAR(periods * 1e3 / RATE_HZ, 1.6, 0.06);
+}
+
+TEST(MovingLoad, a_trend_withholds_four_more_stages_each_time_constant_up_to_all) {
+    Detector detector;
+    while (detector.step(COUNT / 4) == 0) {
+    }
+    EXPECT_EQ(detector.state.withheld, 1 + WIDENING) << "besides that of a beat";
+    uint32_t periods = 1;
+    while (detector.step(COUNT / 4) == 1 + WIDENING) {
+        periods++;
+    }
+    EXPECT_EQ(periods, detector.parameters.time_constant);
     EXPECT_EQ(detector.state.withheld, STAGES);
-    EXPECT_NEAR(periods, RATE_HZ / 200, 2);
+    EXPECT_EQ(detector.run(RATE_HZ, COUNT / 4), RATE_HZ);
+    EXPECT_EQ(detector.state.withheld, STAGES);
+}
+
+TEST(MovingLoad, a_trend_that_the_wider_bandwidth_ends_withholds_no_more) {
+    Detector detector;
+    while (detector.step(COUNT / 6) == 0) {
+    }
+    for (uint32_t k = 0; k < RATE_HZ / 50; k++) {
+        ASSERT_EQ(detector.step(COUNT / 10), 1 + WIDENING);
+    }
 }
 
 TEST(MovingLoad, trends_in_the_stage_of_a_beat_alone_withhold_it_for_up_to_0_8_s) {
@@ -213,13 +212,13 @@ TEST(MovingLoad, a_trigger_releases_what_its_own_step_has_withheld_once) {
     EXPECT_EQ(detector.step(-2 * COUNT, FAST, false, false, true), 0u) << "a load step";
     while (detector.step(-COUNT / 2) == 0) {
     }
-    EXPECT_EQ(detector.step(-2 * COUNT, FAST, false, false, true), STAGES) << "a load that moves";
+    EXPECT_EQ(detector.step(-2 * COUNT, FAST, false, false, true), 1 + WIDENING) << "a load that moves";
 }
 
 TEST(MovingLoad, stages_are_released_after_25_ms_one_each_5_ms) {
     for (const uint32_t rate_hz : {20000u, 40000u, 1000000u}) {
         Detector detector(settings(ENCODER_BITS, rate_hz));
-        while (detector.step(COUNT) == 0) {
+        while (detector.step(COUNT) < STAGES) {
         }
         const uint32_t withheld = detector.run(rate_hz, 0);
         // The trend itself decays within milliseconds.
@@ -260,98 +259,6 @@ TEST(MovingLoad, hold_keeps_what_is_withheld_and_withholds_nothing_itself) {
         ASSERT_EQ(moving.step(0, FAST, false, true), STAGES);
     }
     EXPECT_LT(moving.run(RATE_HZ, 0), RATE_HZ / 5) << "released without it";
-}
-
-// J w^2 count / 32 + 1/64 of the largest torque: 0.087 N m + 0.298 N m.
-const double RANGE_MIN_NM = 0.02 * 1700.0 * 1700.0 * 2.0 * PI / std::ldexp(32.0, ENCODER_BITS) + 19.1 / 64.0;
-
-TEST(MovingLoad, a_repeated_trend_of_a_load_that_does_not_move_is_not_followed_any_more) {
-    for (const double range : {0.0, 0.97, 1.03, 3.0}) {
-        Detector detector;
-        detector.range_q24 = to_fixed(range * RANGE_MIN_NM, Q24);
-        withheld_part(&detector, 2.0, COUNT / 7);
-        EXPECT_EQ(withheld_part(&detector, 10.0, COUNT / 7), range > 1.0 ? 1.0 : 0.0) << range;
-    }
-}
-
-TEST(MovingLoad, a_single_trend_leaves_the_threshold) {
-    Detector detector;
-    detector.range_q24 = 0;
-    for (int repeat = 0; repeat < 10; repeat++) {
-        EXPECT_GT(detector.run(RATE_HZ / 50, COUNT / 7), 0u) << repeat;
-        detector.run(RATE_HZ, 0);
-    }
-}
-
-TEST(MovingLoad, a_movement_restores_the_threshold) {
-    Detector detector;
-    detector.range_q24 = 0;
-    withheld_part(&detector, 2.0, COUNT / 4);
-    ASSERT_EQ(withheld_part(&detector, 1.0, COUNT / 4), 0.0);
-    detector.range_q24 = to_fixed(2.0, Q24);
-    detector.run(RATE_HZ / 2, 0);
-    EXPECT_GT(withheld_part(&detector, 1.0, COUNT / 7), 0.95);
-}
-
-TEST(MovingLoad, a_slow_movement_is_followed) {
-    // 4 N m/s: 1.04 of the least range in 100 ms.
-    Detector detector;
-    detector.range_q24 = 0;
-    double withheld = 0.0;
-    for (int k = 0; k < 100; k++) {
-        detector.load_q24 = to_fixed(0.4 * k, Q24);
-        withheld += withheld_part(&detector, 0.1, 2 * COUNT / 7) / 100.0;
-    }
-    EXPECT_GT(withheld, 0.95);
-}
-
-TEST(MovingLoad, ripple_after_a_load_step_is_not_followed_any_more_within_300_ms) {
-    Detector detector;
-    detector.run(RATE_HZ / 2, COUNT / 4); // the load moves
-    detector.load_q24 = to_fixed(8.0, Q24);
-    detector.range_q24 = 0;
-    EXPECT_GT(withheld_part(&detector, 0.15, COUNT / 4), 0.95);
-    withheld_part(&detector, 0.15, COUNT / 4);
-    EXPECT_EQ(withheld_part(&detector, 1.0, COUNT / 4), 0.0);
-}
-
-TEST(MovingLoad, after_a_movement_the_threshold_is_that_of_ripple_until_the_next_one) {
-    Detector detector;
-    withheld_part(&detector, 0.5, COUNT / 4);
-    detector.range_q24 = 0;
-    detector.run(RATE_HZ / 4, 0);
-    EXPECT_EQ(detector.run(RATE_HZ, COUNT / 4), 0u);
-    detector.range_q24 = to_fixed(10.0, Q24);
-    EXPECT_GT(detector.run(RATE_HZ / 10, COUNT / 4), RATE_HZ / 20);
-}
-
-TEST(MovingLoad, more_than_ripple_of_a_constant_load_keeps_the_base_threshold_and_the_long_hold_for_half_a_second) {
-    Detector detector;
-    detector.range_q24 = 0;
-    while (detector.state.source != MOVING_LOAD_SOURCE_RIPPLE) {
-        detector.step(detector.state.withheld < STAGES ? COUNT / 4 : 0);
-        ASSERT_LT(detector.state.still, detector.parameters.still_reviews / 2);
-    }
-    while (detector.state.source == MOVING_LOAD_SOURCE_RIPPLE) {
-        detector.step(detector.state.withheld < STAGES ? COUNT / 2 : 0);
-        ASSERT_LT(detector.state.still, detector.parameters.still_reviews * 3 / 4);
-    }
-    for (uint32_t k = 0; k < 3 * detector.parameters.hold_ticks_min; k++) {
-        ASSERT_EQ(detector.step(0), STAGES);
-    }
-    EXPECT_LT(detector.state.still, detector.parameters.still_reviews);
-    EXPECT_NE(detector.state.source, MOVING_LOAD_SOURCE_RIPPLE);
-    withheld_part(&detector, 0.5, COUNT / 4);
-    EXPECT_EQ(detector.state.source, MOVING_LOAD_SOURCE_RIPPLE) << "after half a second";
-}
-
-TEST(MovingLoad, the_threshold_of_ripple_is_five_sixteenths_of_a_count) {
-    for (const double counts : {0.30, 0.36}) { // with 0.3 urad and the rounding at this speed 0.34
-        Detector detector;
-        detector.range_q24 = 0;
-        withheld_part(&detector, 2.0, COUNT / 4);
-        EXPECT_EQ(withheld_part(&detector, 3.0, int32_t(counts * COUNT)) > 0.5, counts > 0.32) << counts;
-    }
 }
 
 TEST(MovingLoad, edges_have_a_threshold_of_0_7_urad) {

@@ -83,9 +83,9 @@ TEST(DeferredJobs, turns_come_as_often_as_the_periods_of_their_updates_state) {
     EXPECT_EQ(every(TURN_COMMON, TURN_INERTIA) * CONDUCTION_STEPS, size_t(DEFERRED_CONDUCTION_PERIODS));
 }
 
-// Bytes of the data, by bit. Of the moving load those of its review: the rest changes in every step.
+// Bytes of the data, by bit.
 std::vector<std::vector<char>> contents(const deferred_t &deferred) {
-    std::vector<std::vector<char>> data(11);
+    std::vector<std::vector<char>> data(10);
     const auto add = [&data](unsigned bit, const auto &member) {
         for (size_t k = 0; k < data.size(); k++) {
             if (bit == 1u << k) {
@@ -96,9 +96,6 @@ std::vector<std::vector<char>> contents(const deferred_t &deferred) {
     };
     add(DATA_STROKES, deferred.stroke_mean);
     add(DATA_STROKES, deferred.load_constant);
-    add(DATA_MOVING_LOAD, deferred.moving_load.load_q24);
-    add(DATA_MOVING_LOAD, deferred.moving_load.load_min_q24);
-    add(DATA_MOVING_LOAD, deferred.moving_load.load_max_q24);
     add(DATA_PERIODIC_LOAD, deferred.periodic_load);
     add(DATA_TORQUE_OFFSET, deferred.torque_offset);
     add(DATA_SPEED_LAW, deferred.speed_smc);

@@ -109,12 +109,13 @@ struct moving_load_t {
     double rate_hz, threshold;
     unsigned stages;
     double settling_s; // after a trigger
-    double time_constant_s = 1.6e-3, hold_min_s = 0.05, hold_max_s = 0.8, release_s = 0.005;
+    double time_constant_s = 1.6e-3, hold_min_s = 0.025, hold_max_s = 0.8, release_s = 0.005;
     double trend = 0.0, hold_s = 0.0, remaining_s = 0.0, settled_s = 0.0, time_s = 0.0;
     unsigned withheld = 0;
+    bool releasing = false;
 
-    // rounding: added to the threshold; beat: the bandwidth is that of a beat.
-    unsigned step(double innovation, double rounding, bool triggered, bool beat = false) {
+    // rounding: added to the threshold; kept: stages that the present bandwidth does not reach, 0 in that of a beat.
+    unsigned step(double innovation, double rounding, bool triggered, unsigned kept) {
         const double magnitude = time_s < settled_s ? 0.0 : std::fabs(trend);
         time_s += 1.0 / rate_hz;
         remaining_s -= 1.0 / rate_hz;
@@ -123,16 +124,18 @@ struct moving_load_t {
             settled_s = time_s + settling_s;
         }
         if (magnitude > threshold + rounding) {
-            const unsigned wanted = beat ? 1 : stages;
+            const unsigned wanted = std::min(stages, kept == 0 ? 1 : kept + 4);
             if (withheld < wanted) {
-                hold_s *= 2.0;
-                settled_s = time_s + release_s;
+                settled_s = time_s + time_constant_s;
+                hold_s *= withheld == 0 || releasing ? 2.0 : 1.0;
             }
+            releasing = false;
             hold_s = std::clamp(hold_s, hold_min_s, hold_max_s);
             withheld = std::max(withheld, wanted);
             remaining_s = hold_s;
         } else if (remaining_s <= 0.0 && withheld > 0) {
             withheld--;
+            releasing = true;
             remaining_s = withheld > 0 ? release_s : hold_s;
         } else if (remaining_s <= 0.0) {
             hold_s /= 2.0;

@@ -154,12 +154,15 @@ class salient_t {
         const unsigned triggers = bandwidth.triggers;
         const double now_rad_s = bandwidth.step(innovation, from_edge, least_rad_s, beat);
         const double counts = std::ldexp(std::fabs(observer.speed * observer.angle_step), int(encoder_bits));
-        const bool narrow = now_rad_s < bandwidth.steady_rad_s;
+        unsigned kept = 0;
+        while (kept < OBSERVER_BANDWIDTH_STAGES - 1 && stage_rad_s[OBSERVER_BANDWIDTH_STAGES - 1 - kept] < now_rad_s) {
+            kept++;
+        }
         const double rounding = from_edge ? 0.0 : rounding_counts(counts, moving_load[0].time_constant_s * rate_hz);
         // These act in the next period.
         beat = rounding >= 1.0 / 24.0 && counts >= 0.5;
         const unsigned withheld = moving_load[from_edge].step(innovation, std::ldexp(rounding, -int(encoder_bits)),
-                                                              bandwidth.triggers > triggers, narrow);
+                                                              bandwidth.triggers > triggers, kept);
         least_rad_s = withheld > 0 ? stage_rad_s[OBSERVER_BANDWIDTH_STAGES - 1 - withheld] : 0.0;
         observer.set_gains(observer_of(now_rad_s));
         observer.step(measured, torque);
