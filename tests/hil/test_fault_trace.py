@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import re
+import threading
+
 import numpy as np
 import pytest
+from can import Message
 
 from salient.bench import scope
 from salient.bench.bench import Bench
@@ -131,3 +136,46 @@ def test_scope_writes_the_buffer_as_table_and_plot_and_says_when_there_is_none(t
         assert table[name] == pytest.approx(values)
     assert np.max(table["current_a_A"]) > 1 or np.max(table["current_b_A"]) > 1
     assert (out / scope.PLOT).stat().st_size > 10_000
+
+
+DATABASE = """VERSION ""
+BU_: ABS BMS
+BO_ 300 WHEELS: 8 ABS
+ SG_ front_left : 7|16@0+ (0.01,0) [0|655.35] "km/h" BMS
+BO_ 310 CHARGE: 2 BMS
+ SG_ part : 0|10@1+ (0.1,0) [0|100] "%" ABS
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 300 10;
+BA_ "GenMsgCycleTime" BO_ 310 100;
+"""
+
+
+def test_scope_has_the_signals_and_the_traffic_of_other_nodes_while_it_reads(tmp_path, capsys):
+    """ABS sends throughout, BMS never: 100 ms of it are three cycles in the time of the buffer."""
+    can, out, database = f"unix:{tmp_path}/bus.sock", tmp_path / "out", tmp_path / "brake.dbc"
+    database.write_text(DATABASE, encoding="utf-8")
+    arguments = make_parser().parse_args(["scope", "--can", can, "--out", str(out), "--dbc", str(database)])
+    with EmulatorProcess(BenchConfig(pace="x0.2"), can), Session(can, lockstep=False) as session:
+        session.rig.sto_1 = 1
+        session.run_for(0.03)
+        ends = threading.Event()
+
+        def send() -> None:
+            while not ends.is_set():
+                session.send(Message(arbitration_id=300, is_extended_id=False, data=b"\x30\x39" + bytes(6)))
+                session.run_for(0.01)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        assert scope.run(arguments) == 0
+        ends.set()
+        sender.join()
+    printed = capsys.readouterr().out
+    with (out / scope.SIGNALS).open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["message"] == "WHEELS"]
+    times_s = [float(row["time_s"]) for row in rows]
+    assert len(rows) > 20 and {(row["value"], row["unit"]) for row in rows} == {("123.45", "km/h")}
+    assert np.mean(np.diff(times_s)) == pytest.approx(0.010, rel=0.05) and times_s[-1] - times_s[0] > 0.25
+    assert re.search(r"^ +12C WHEELS .*expected +10 ms", printed, re.MULTILINE)
+    assert re.search(r"^ +136 CHARGE .*expected +100 ms +never$", printed, re.MULTILINE)

@@ -273,7 +273,7 @@ def databases_of(path):
         ({"a.dbc": 'VERSION ""\nBO_ 1 M: 100 A\n'}, "--dbc a.dbc: no valid DBC: M has 100 bytes, a frame at most 64"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("command", ["monitor", "log", "view"])
+@pytest.mark.parametrize("command", ["monitor", "log", "view", "scope"])
 def test_a_database_that_cannot_be_used_is_one_line(salient_without_build, tmp_path, command, files, line):
     for name, text in files.items():
         if text is not None:

@@ -253,6 +253,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                        help="folder (default %(default)s)")
     _add_machine(scope)
     _add_node(scope)
+    _add_databases(scope, "whose signals while the buffer is read are a table, too, and whose messages are watched")
+    _add_bit_rates(scope)
 
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)

@@ -1,36 +1,75 @@
 """The drive's triggered buffer, the control periods up to the one that latched a fault, as table and plot:
-`tools/salient scope`. The drive keeps them from the fault to the next run."""
+`tools/salient scope`. The drive keeps them from the fault to the next run. It does not keep the signals of other nodes:
+those are of the time in which the buffer is read."""
 
 from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
+from cantools.database.can import Database
 
 from salient.bench.drive import FaultTrace
 from salient.bench.failure import COLOURS
 from salient.bench.session import SILENCE_MAX_S, Session
+from salient.bus.databases import load_databases, messages_of
+from salient.bus.frame_bits import BitRates
+from salient.bus.log import open_log
+from salient.bus.traffic import MISSING_CYCLES, Traffic
+from salient.bus.traffic_text import report_lines
 from salient.paths import make_folder
 
-TABLE, PLOT = "scope.csv", "scope.png"
+TABLE, PLOT, SIGNALS = "scope.csv", "scope.png", "signals.csv"
+LISTEN_MAX_S = 5.0
+"""To other nodes; a message of a longer cycle may be told as one that never came."""
 _MS_PER_S, _PERCENT = 1000.0, 100.0
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reads the buffer of a running drive into a folder; returns the exit code."""
-    make_folder(options.out, [TABLE, PLOT])
+    """Reads the buffer of a running drive into a folder; returns the exit code. dbc: databases of other nodes; with
+    them the signals of the bus meanwhile are a table, too, and its traffic is printed. UsageError: see
+    load_databases."""
+    others = load_databases(options.dbc, options.node)
+    make_folder(options.out, [TABLE, PLOT, *([SIGNALS] if others else [])])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
                  silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
         trace = session.drive.fault_trace()
         log = session.drive.fault_log.read()
+        if others:
+            _listen(session, others)
     title = f"{log[-1].fault} in state {log[-1].state}" if log else "fault"
     write_table(trace, options.out / TABLE)
     plot(trace, options.out / PLOT, title)
     print(f"{title}: {len(trace.time_s)} control periods: {options.out / TABLE}, {options.out / PLOT}")
+    if others:
+        _tell_bus(options, session.log, others)
     return 0
+
+
+def _listen(session: Session, others: Sequence[Database]) -> None:
+    """Receives until a message of any cycle would be missing."""
+    longest_s = max((message.cycle_time or 0 for message in messages_of(others)), default=0) / _MS_PER_S
+    end_ns = session.log[0][0] + round(1e9 * min(LISTEN_MAX_S, MISSING_CYCLES * longest_s))
+    session.advance_to(max(session.time_ns, end_ns))
+
+
+def _tell_bus(options: argparse.Namespace, frames: Sequence[tuple[int, can.Message]], others: Sequence[Database]
+              ) -> None:
+    """Writes the signals of some frames, and prints their traffic."""
+    path = options.out / SIGNALS
+    log = open_log(path, options.machine, options.node, options.can, others=others)
+    traffic = Traffic(BitRates(options.bit_rate, options.data_bit_rate), others, options.node)
+    for time_ns, message in frames:
+        log.write(time_ns, message)
+        traffic.add(time_ns, message)
+    log.close()
+    print(f"signals of the bus while it was read: {path}")
+    print("\n".join(report_lines(traffic.total())))
 
 
 def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
