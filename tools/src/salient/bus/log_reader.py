@@ -15,6 +15,7 @@ from salient.bus.clock import nodes_of_messages
 from salient.bus.databases import messages_of
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_input import Damage, LogInput
+from salient.bus.mf4_reader import read_mf4
 from salient.bus.signals import frame_key
 from salient.bus.text_logs import Frames, nanoseconds, read_text
 from salient.config import READABLE_SUFFIXES, Rotation, either
@@ -120,8 +121,7 @@ def read_log(path: Path, option: str = "--convert") -> Iterator[tuple[int, can.M
 
     UsageError: the suffix or the file is none that can be read, or no frame is before its damage; LogDamaged, after the
     frames that can be read: the rest cannot be, or something that is no frame was left out. Both begin with the option.
-    The work and the memory are bounded by the size of the file, the memory of text, BLF and what is compressed by a
-    constant.
+    The work is bounded by the size of the file, the memory by a constant.
     """
     suffix = Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     if suffix not in READABLE_SUFFIXES:
@@ -149,8 +149,6 @@ def _frames(file: LogInput, path: Path, suffix: str) -> Frames:
     if suffix == ".blf":
         return read_blf(file)
     if suffix == ".mf4":
-        from salient.bus.mf4_reader import read_mf4  # asammdf loads pandas: a second that only this format needs
-
         return read_mf4(file, path)
     if suffix == ".db":
         return _read_database(path)
