@@ -13,11 +13,13 @@ _FLUX = {name: factor for prefix, factor in (("", 1.0), ("m", 1e-3), ("u", 1e-6)
          for name in (prefix + unit for unit in (
              "wb", "vs", "v.s", "v*s", "v s", "v-s", "wb-turns", "wb-turn", "wb-t", "wbt", "wb turns", "wb.turns",
              "webers", "weber"))}
-_OTHER = {"s", "ms", "us", "ns", "v", "mv", "h", "mh", "uh", "nm", "n.m", "n m", "mnewtonmeter", "newtonmeter", "j",
+_INDUCTANCE = {"h": 1.0, "henry": 1.0, "mh": 1e-3, "uh": 1e-6, "µh": 1e-6, "μh": 1e-6}
+_OTHER = {"s", "ms", "us", "ns", "v", "mv", "nm", "n.m", "n m", "mnewtonmeter", "newtonmeter", "j",
           "mj", "w", "t", "ohm", "hz", "rpm", "kg"}
 _NAMES = (
     ("phase", r"^(phase|ph|winding|coil|strang)(_?(no|nr|number|id))?$"),
-    ("other", r"torque|drehmoment|^time|^t$|volt|induct|co-?energy|energie|loss|speed|^l_|^mm"),
+    ("other", r"torque|drehmoment|^time|^t$|volt|energ|loss|speed|^mm|(?:incr|diff).*induct"),
+    ("inductance", r"induct|induktiv|^l$|^l_"),
     ("flux", r"flux|fluss|linkage|lambda|psi|λ|ψ|^wb|^f(?:l|tbl)"),
     ("angle", r"angle|theta|position|winkel|rotor|θ|^pos|^deg|^phi|elec|mech|displ|^th$"),
     ("current", r"current|strom|courant|^i\d?$|^i_|_i$|^i[abcd]{1,2}\d?(_|$)|amp|^curr"),
@@ -26,13 +28,14 @@ _NAMES = (
 
 @dataclass(frozen=True)
 class Column:
-    """Meaning of a column or a value: role angle, current, flux, phase or other."""
+    """Meaning of a column or a value: role angle, current, flux, inductance (flux linkage by current), phase or
+    other."""
 
     role: str
     unit: str | None = None
     """Of an angle: deg, rad, mdeg or mrad, with "electrical " before it where the name says so."""
     factor: float | None = None
-    """To A or Wb; None where no unit is stated."""
+    """To A, Wb or H; None where no unit is stated."""
 
 
 def column(name: str) -> Column | None:
@@ -61,6 +64,8 @@ def _by_unit(unit: str, name: str) -> Column | None:
         return Column("current", factor=_CURRENT[unit])
     if unit in _FLUX:
         return Column("flux", factor=_FLUX[unit])
+    if unit in _INDUCTANCE:
+        return Column("inductance", factor=_INDUCTANCE[unit])
     return Column("other") if unit in _OTHER else None
 
 

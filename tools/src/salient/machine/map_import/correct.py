@@ -30,7 +30,7 @@ from salient.machine.flux_map_origin import WHOLE_RAD, Origin, find_origin
 from salient.machine.map_import.columns import radians
 from salient.machine.map_import.layouts import Points
 
-ASYMMETRY_MAX = 0.12  # between the halves of a pitch, of the map's greatest flux linkage
+ASYMMETRY_MAX = 0.08  # between the halves of a pitch, of the map's greatest flux linkage
 SPREAD_MAX = 0.12  # between phases, likewise
 REPAIR_MAX = 0.04  # for a monotonic curve, of the aligned flux linkage at that current
 OFFSET_MAX = 0.02  # at 0 A, of the map's greatest flux linkage
@@ -72,6 +72,8 @@ class _Phase:
 def correct(points: Points, rotor_poles: int, phases: int, supply: Supply) -> Imported:
     """The map of points. FluxMapError, with the line of the file where one can be named."""
     lines = [f"layout: {points.layout}, {len(points.rows)} points"]
+    if points.left_out:
+        lines.append(f"left out: {points.left_out} tables that are not of flux linkages, by their titles")
     table = _clean(points, supply, lines)
     pitch_deg = 360.0 / rotor_poles
     table_rad, unit = _in_radians(table, points.angle_unit, rotor_poles)

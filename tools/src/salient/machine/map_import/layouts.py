@@ -16,6 +16,10 @@ from salient.machine.map_import.columns import Column, column, condition
 from salient.machine.map_import.text import Block, Row, number
 
 
+_TITLE_MAX = 60
+"""Characters of a title that is a quantity, not a description."""
+
+
 @dataclass
 class Points:
     """Points as a file has them, and what it says about their units."""
@@ -26,24 +30,37 @@ class Points:
     current_stated: bool = True
     flux_stated: bool = True
     layout: str = ""
+    left_out: int = 0
+    """Tables of other quantities."""
 
     def add(self, line: int, phase: int, angle: float, current: float, flux: float) -> None:
         if math.isfinite(angle) and math.isfinite(current) and math.isfinite(flux):
             self.rows.append((line, phase, angle, current, flux))
+
+    def value(self, flux: Column | None, current_A: float, value: float) -> float:
+        """The flux linkage of a value in a column, with the factor of `units`: an inductance is that by the current."""
+        if flux is None or flux.role != "inductance":
+            return value
+        if "inductance" not in self.layout:
+            self.layout += ", inductance times current"
+        return value * current_A
 
     def units(self, angle: Column | None, current: Column | None, flux: Column | None) -> tuple[float, float]:
         """Notes the units, and returns the factors of current and flux linkage."""
         if angle is not None and angle.unit is not None:
             self.angle_unit = angle.unit
         self.current_stated &= current is not None and current.factor is not None
-        self.flux_stated &= flux is not None and flux.factor is not None
+        self.flux_stated &= flux is not None and flux.factor is not None and (
+            flux.role != "inductance" or self.current_stated)
         return (current and current.factor) or 1.0, (flux and flux.factor) or 1.0
 
 
 def points_of(found: Sequence[Block]) -> Points:
     """The points of all blocks. FluxMapError."""
     points = Points()
-    blocks = _joined(found)
+    joined = _joined(found)
+    blocks = _of_flux(joined)
+    points.left_out = len(joined) - len(blocks)
     named: dict[str, int] = {}
     for at, block in enumerate(blocks):
         phase = _phase(block, named)
@@ -53,6 +70,31 @@ def points_of(found: Sequence[Block]) -> Points:
     if not points.rows:
         raise FluxMapError("no table of angle, current and flux linkage found")
     return points
+
+
+def _of_flux(blocks: Sequence[Block]) -> list[Block]:
+    """The blocks without those of other quantities. FluxMapError: there is no other."""
+    kept = [block for block in blocks if (of := _quantity(block)) is None or of.role != "other"]
+    if blocks and not kept:
+        raise FluxMapError(f"line {blocks[0].rows[0].line}: {blocks[0].titles[-1]!r:.60} above it: no flux linkage or"
+                           " inductance")
+    fluxes = [block for block in kept if (of := _quantity(block)) is not None and of.role == "flux"]
+    return [block for block in kept if not fluxes or (of := _quantity(block)) is None or of.role == "flux"]
+
+
+def _quantity(block: Block) -> Column | None:
+    """The quantity that the corner of a matrix, or else the last title of a block without named columns states."""
+    if sum(number(cell) is None for cell in block.header) > 1:
+        return None
+    corner = block.header[0] if block.header and number(block.header[0]) is None else ""
+    titles = [title for title in block.titles if len(title) < _TITLE_MAX and (
+        not block.header or title.split(",")[0] != block.header[0])]
+    for text in (corner, *reversed(titles)):
+        for part in re.split(r"[\\|;,]|(?<=[\])])\s", text):
+            of = column(part) if part.strip() else None
+            if of is not None and of.role in ("flux", "inductance", "other"):
+                return of
+    return None
 
 
 def _joined(found: Sequence[Block]) -> list[Block]:
@@ -102,8 +144,11 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
     conditions = [condition(cell) if re.search(r"\d", cell) else None for cell in block.header]
     stated = next((found for title in block.titles if (found := condition(title)) and (
         (len(title) < 60 and not block.header) or title != " ".join(block.header))), None)
-    if len(columns) == width and {"angle", "current", "flux"} <= set(roles):
+    if len(columns) == width and {"angle", "current"} <= set(roles) and {"flux", "inductance"} & set(roles):
         _long(points, block, columns, phase)
+    elif len(columns) == width and {"angle", "current", "other"} <= set(roles):
+        raise FluxMapError(f"line {block.rows[0].line}: the columns {', '.join(block.header)!r:.80} have no flux linkage"
+                           " or inductance")
     elif len(columns) == width and sum(of is not None for of in conditions) >= 3:
         _by_condition(points, block, columns, conditions, phase)
     elif len(block.header) in (width, width - 1) and _is_matrix_head(block):
@@ -122,18 +167,20 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
 def _long(points: Points, block: Block, columns: Sequence[Column | None], phase: int) -> None:
     points.layout = points.layout or "a row for each point"
     of = {role: [at for at, meaning in enumerate(columns) if meaning and meaning.role == role]
-          for role in ("angle", "current", "flux", "phase")}
+          for role in ("angle", "current", "flux", "inductance", "phase")}
     names: dict[str, int] = {}
-    for index, at in enumerate(of["flux"]):
-        current_at = of["current"][index if len(of["current"]) == len(of["flux"]) else 0]
-        angle_at = of["angle"][index if len(of["angle"]) == len(of["flux"]) else 0]
+    fluxes = of["flux"] or of["inductance"]
+    for index, at in enumerate(fluxes):
+        current_at = of["current"][index if len(of["current"]) == len(fluxes) else 0]
+        angle_at = of["angle"][index if len(of["angle"]) == len(fluxes) else 0]
         current_factor, flux_factor = points.units(columns[angle_at], columns[current_at], columns[at])
         for row in block.rows:
             if len(row.values) < len(columns):
                 raise FluxMapError(f"line {row.line}: {len(row.values)} cells; the header has {len(columns)}")
             own = names.setdefault(row.cells[of["phase"][0]], len(names)) if of["phase"] else phase + index
-            points.add(row.line, own, row.values[angle_at], current_factor * row.values[current_at],
-                       flux_factor * row.values[at])
+            current_A = current_factor * row.values[current_at]
+            points.add(row.line, own, row.values[angle_at], current_A,
+                       points.value(columns[at], current_A, flux_factor * row.values[at]))
 
 
 def _by_condition(points: Points, block: Block, columns: Sequence[Column | None],
@@ -144,8 +191,9 @@ def _by_condition(points: Points, block: Block, columns: Sequence[Column | None]
     roles = [meaning.role if meaning else None for meaning in columns]
     seen: dict[float, int] = {}
     free = [at for at, of in enumerate(conditions) if of is None]
+    wanted_role = "flux" if "flux" in roles or "inductance" not in roles else "inductance"
     for at, stated in enumerate(conditions):
-        if stated is None or roles[at] not in (None, "flux", stated[0].role):
+        if stated is None or roles[at] not in (None, wanted_role, stated[0].role):
             continue
         meaning, value = stated
         wanted = "angle" if meaning.role == "current" else "current"
@@ -155,7 +203,7 @@ def _by_condition(points: Points, block: Block, columns: Sequence[Column | None]
         if not lefts:
             raise FluxMapError(f"line {block.rows[0].line}: no column of the {wanted} left of {block.header[at]!r:.60}")
         left = columns[lefts[-1]]
-        flux = columns[at] if roles[at] == "flux" else None
+        flux = columns[at] if roles[at] == wanted_role else None
         angle, current = (left, meaning) if wanted == "angle" else (meaning, left)
         current_factor, flux_factor = points.units(angle, current, flux)
         own = phase + seen.get(value, 0)
@@ -163,26 +211,29 @@ def _by_condition(points: Points, block: Block, columns: Sequence[Column | None]
         for row in block.rows:
             if len(row.values) > at:
                 pair = (row.values[lefts[-1]], value) if wanted == "angle" else (value, row.values[lefts[-1]])
-                points.add(row.line, own, pair[0], current_factor * pair[1], flux_factor * row.values[at])
+                current_A = current_factor * pair[1]
+                points.add(row.line, own, pair[0], current_A,
+                           points.value(flux, current_A, flux_factor * row.values[at]))
 
 
 def _one_curve(points: Points, block: Block, columns: Sequence[Column | None], stated: tuple[Column, float], phase: int
                ) -> None:
     points.layout = points.layout or "a block for each current or angle"
     meaning, value = stated
-    by = columns if len(columns) == 2 else [None, None]
+    by = columns if len(columns) == 2 else [None, _quantity(block)]
     angle, current = (by[0], meaning) if meaning.role == "current" else (meaning, by[0])
     current_factor, flux_factor = points.units(angle, current, by[1])
     for row in block.rows:
         pair = (row.values[0], value) if meaning.role == "current" else (value, row.values[0])
-        points.add(row.line, phase, pair[0], current_factor * pair[1], flux_factor * row.values[1])
+        current_A = current_factor * pair[1]
+        points.add(row.line, phase, pair[0], current_A, points.value(by[1], current_A, flux_factor * row.values[1]))
 
 
 def _matrix_with_head(points: Points, block: Block, phase: int) -> None:
     cells = block.header if len(block.header) == len(block.rows[0].cells) else ("", *block.header)
     head = [number(cell) for cell in cells[1:]]
-    _matrix(points, [value if value is not None else math.nan for value in head], block.rows,
-            " ".join([cells[0], *block.titles]), phase)
+    _matrix(points, [value if value is not None else math.nan for value in head], block, block.rows,
+            phase)
 
 
 def _rows_of_grid(block: Block) -> bool:
@@ -205,24 +256,48 @@ def _bare_matrix(points: Points, block: Block, phase: int) -> None:
                            " rising currents and angles")
     head = block.rows[0].values
     head = head[1:] if len(head) == len(block.rows[1].values) else head
-    _matrix(points, head, block.rows[1:], " ".join([*block.titles, *block.header]), phase)
+    _matrix(points, head, block, block.rows[1:], phase)
 
 
-def _matrix(points: Points, head: Sequence[float], rows: Sequence[Row], title: str, phase: int) -> None:
+def _matrix(points: Points, head: Sequence[float], block: Block, rows: Sequence[Row], phase: int) -> None:
     """Flux linkages, the currents or the angles in the head, the others in the first column."""
     points.layout = points.layout or "a matrix"
     left = np.array([row.values[0] for row in rows])
     values = np.array([(list(row.values[1:]) + [math.nan] * len(head))[:len(head)] for row in rows])
+    title = " ".join([*block.header[:1], *block.titles])
     units = [meaning for word in re.split(r"[\\|;,]|\s{1,}|/(?=\s*\w{2,})", title) if (meaning := column(word))]
     angle = next((of for of in units if of.role == "angle" and of.unit), None)
     current = next((of for of in units if of.role == "current" and of.factor), None)
-    flux = next((of for of in units if of.role == "flux" and of.factor), None)
+    of_block = _quantity(block)
+    role = of_block.role if of_block is not None and of_block.role == "inductance" else "flux"
+    flux = next((of for of in units if of.role == role and of.factor), of_block if role == "inductance" else None)
+    if role == "inductance":
+        points.layout += "" if "inductance" in points.layout else ", inductance times current"
     current_factor, flux_factor = points.units(angle, current, flux)
-    down = _proportional(left, values.T) < _proportional(np.array(head), values)  # currents in the first column
+    if role == "inductance":
+        down = _is_down(title, left, head)
+    else:
+        down = _proportional(left, values.T) < _proportional(np.array(head), values)  # currents in the first column
     for row, start, fluxes in zip(rows, left, values, strict=True):
         for of, value in zip(head, fluxes, strict=True):
             pair = (of, start) if down else (start, of)
-            points.add(row.line, phase, float(pair[0]), current_factor * float(pair[1]), flux_factor * float(value))
+            current_A = current_factor * float(pair[1])
+            points.add(row.line, phase, float(pair[0]), current_A,
+                       points.value(flux, current_A, flux_factor * float(value)))
+
+
+def _is_down(title: str, left: np.ndarray, head: Sequence[float]) -> bool:
+    """Whether the currents are in the first column of a matrix of inductances, which no value shows. FluxMapError: the
+    title does not name both axes."""
+    found = {role: re.search(pattern, title, re.IGNORECASE) for role, pattern in (
+        ("angle", r"angle|theta|position|winkel|\bdeg|\brad\b"), ("current", r"current|strom|\bi\b|\ba\b|amp"))}
+    angle, current = found["angle"], found["current"]
+    if min(left) < 0.0 or min(head) < 0.0:
+        return min(head) < 0.0
+    if angle is None or current is None:
+        raise FluxMapError("a matrix of inductances whose corner does not name the quantity down and the one across, as"
+                           " 'L [mH] angle [deg] \\ current [A]'")
+    return current.start() < angle.start()
 
 
 def _proportional(axis: np.ndarray, values: np.ndarray) -> float:

@@ -37,8 +37,9 @@ def mat_points(data: bytes) -> Points:
     fluxes = {name: (of, array) for name, (of, array) in found.items() if array.ndim in (2, 3)
               and not (of is not None and of.role == "other")}
     vectors = {name: (of, array) for name, (of, array) in found.items() if array.ndim == 1 and len(array) > 3}
-    for flux, array in sorted(fluxes.values(), key=lambda item: item[0] is None or item[0].role != "flux"):
-        if (flux is None or flux.role == "flux") and (axes := _axes(array.shape, vectors)) is not None:
+    order = {"flux": 0, "inductance": 1}
+    for flux, array in sorted(fluxes.values(), key=lambda item: order.get(item[0].role if item[0] else "", 2)):
+        if (flux is None or flux.role in order) and (axes := _axes(array.shape, vectors)) is not None:
             return _matrix_points(array, flux, axes)
         if array.ndim == 2 and array.shape[1] in (3, 4) and flux is None:
             return _rows(array)
@@ -86,7 +87,8 @@ def _matrix_points(array: np.ndarray, flux: Column | None, axes: tuple[Axis, Axi
     for phase, matrix in enumerate(ordered):
         for row, (at, fluxes) in enumerate(zip(angles, matrix, strict=True), start=1):
             for value, psi in zip(currents, fluxes, strict=True):
-                points.add(row, phase, float(at), current_factor * float(value), flux_factor * float(psi))
+                current_A = current_factor * float(value)
+                points.add(row, phase, float(at), current_A, points.value(flux, current_A, flux_factor * float(psi)))
     return points
 
 
@@ -99,7 +101,9 @@ def _rows(array: np.ndarray) -> Points:
 def _columns(found: dict[str, tuple[Column | None, np.ndarray]]) -> Points | None:
     """Arrays of equal size, a value of each for each point (also of a mesh grid)."""
     by_role = {role: next(((of, array.ravel()) for of, array in found.values() if of is not None and of.role == role),
-                          None) for role in ("angle", "current", "flux")}
+                          None) for role in ("angle", "current", "flux", "inductance")}
+    inductance = by_role.pop("inductance")
+    by_role["flux"] = by_role["flux"] or inductance
     parts = [part for part in by_role.values() if part is not None]
     if len(parts) < 3 or len({len(array) for _, array in parts}) != 1:
         return None
@@ -107,5 +111,6 @@ def _columns(found: dict[str, tuple[Column | None, np.ndarray]]) -> Points | Non
     (angle, angles), (current, currents), (flux, fluxes) = parts
     current_factor, flux_factor = points.units(angle, current, flux)
     for at, (theta, i, psi) in enumerate(zip(angles, currents, fluxes, strict=True), start=1):
-        points.add(at, 0, float(theta), current_factor * float(i), flux_factor * float(psi))
+        current_A = current_factor * float(i)
+        points.add(at, 0, float(theta), current_A, points.value(flux, current_A, flux_factor * float(psi)))
     return points
