@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from salient.experiments import metrics
+from salient.experiments.compare.random_maps import random_map
 from salient.machine.drive_data import derive
 from salient.machine.file import Machine, load_machine, machine_path
 from salient.machine.flux_map import FluxMap
@@ -36,6 +37,17 @@ KINDS = ("0.5 deg off", "2 deg off", "phases differ", "halves differ")
 def currents(machine: Machine) -> np.ndarray:
     most_A = min(1.5 * derive(machine).parameters["current_limit_A"], machine.magnetics.current_max_A)
     return np.linspace(0.0, most_A, CURRENTS + 1)[1:]
+
+
+def source_of(name: str, folder: Path) -> Path:
+    """The machine file of a bundled machine, or of a random one by its number."""
+    if not name.startswith("random"):
+        return machine_path(name)
+    text, values = random_map(int(name.removeprefix("random")))
+    path = folder / f"{tomllib.loads(text)['name']}.toml"
+    path.write_text(text, encoding="utf-8")
+    path.with_suffix(".csv").write_text(values, encoding="utf-8")
+    return path
 
 
 def right_map(source: Path, machine: Machine, folder: Path) -> Path:
@@ -108,10 +120,10 @@ def ripple(make_bench, folder: Path, drive: Path, motor: Machine, of_base: float
 @pytest.mark.in_turns
 @pytest.mark.parametrize("of_base", PARTS_OF_BASE)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["finite_element", "saturating"])
+@pytest.mark.parametrize("name", ["finite_element", "saturating", "random4", "random5"])
 def test_ripple_with_an_imported_map_is_at_most_1_2_times_that_with_the_right_one(
         make_bench, tmp_path, name, kind, of_base):
-    source = machine_path(name)
+    source = source_of(name, tmp_path)
     motor = load_machine(source)
     file = tmp_path / "table.csv"
     file.write_text(table(motor, kind), encoding="utf-8")

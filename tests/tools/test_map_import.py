@@ -151,6 +151,76 @@ def test_dip_is_refused_with_its_line():
         imported(long_table(values))
 
 
+@pytest.mark.parametrize("row", [0, 4, 9, 14])
+@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("pitches", [0.5, 1.0])
+def test_dip_on_a_flank_is_refused_with_its_line(pitches, rows, row):
+    """A curve that falls there by itself stays monotonic."""
+    angles_deg = np.arange(0.0, PITCH_DEG * pitches + 1.0)
+    values = flux(angles_deg)
+    values[row : row + rows] *= 0.83
+    text = "\n".join(f"{angle:.9g},{current:.9g},{psi:.9g}" for angle, fluxes in zip(angles_deg, values, strict=True)
+                     for current, psi in zip(CURRENTS_A, fluxes, strict=True))
+    with pytest.raises(FluxMapError, match=r"^line \d+"):
+        imported(f"angle_deg,current_A,flux_linkage_Wb\n{text}\n")
+
+
+@pytest.mark.parametrize("form", ["mH", "H", "a matrix in mH", "MAT"])
+def test_inductances_are_multiplied_by_their_current(form):
+    inductances = VALUES / CURRENTS_A
+    if form == "MAT":
+        file = io.BytesIO()
+        savemat(file, {"theta_deg": ANGLES_DEG, "i_A": CURRENTS_A, "L_H": inductances})
+        result = correct(mat_points(file.getvalue()), POLES, PHASES, SUPPLY)
+    elif form == "a matrix in mH":
+        result = imported(matrix(1e3 * inductances, "L [mH] angle [deg] \\ current [A]"))
+    else:
+        result = imported(long_table((1e3 if form == "mH" else 1.0) * inductances, f"angle_deg,current_A,L_{form}"))
+    assert deviation(result) < 5e-3
+    assert "inductance times current" in result.lines[0]
+
+
+def test_matrix_of_inductances_without_named_axes_is_refused():
+    with pytest.raises(FluxMapError, match="whose corner does not name"):
+        imported(matrix(1e3 * VALUES / CURRENTS_A, "L [mH]"))
+
+
+@pytest.mark.parametrize("title", ["Torque [Nm]", "Coenergy [J]"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_table_of_another_quantity_beside_is_left_out_and_that_is_stated(title, is_first):
+    of_flux, other = matrix(VALUES, "Flux linkage [Wb]"), matrix(VALUES**2, title)
+    result = imported("\n".join([other, of_flux] if is_first else [of_flux, other]))
+    assert deviation(result) < 5e-3
+    assert any(line.startswith("left out: 1 tables") for line in result.lines)
+
+
+@pytest.mark.parametrize("quantity", ["coenergy_J", "torque_Nm", "differential_inductance_H"])
+def test_table_without_flux_linkages_is_refused_by_its_columns(quantity):
+    with pytest.raises(FluxMapError, match=rf"line 2: the columns .*{quantity}.* have no flux linkage"):
+        imported(long_table(VALUES, f"angle_deg,current_A,{quantity}"))
+
+
+@pytest.mark.parametrize("shift_deg", [0.0, 0.5, 1.0, 2.0])
+def test_half_a_pitch_is_shifted_where_its_points_show_it_and_else_kept_or_refused(shift_deg):
+    """From aligned it shows the shift; from unaligned, with the peak outside, it does not."""
+    angles_deg = np.arange(0.0, PITCH_DEG / 2.0 + 0.1, 2.0 / 3.0)
+    for first_deg in (0.0, PITCH_DEG / 2.0):
+        at_deg = angles_deg + first_deg
+        text = "\n".join(f"{angle:.9g},{current:.9g},{psi:.9g}"
+                         for angle, fluxes in zip(at_deg, flux(at_deg, shift_deg=shift_deg), strict=True)
+                         for current, psi in zip(CURRENTS_A, fluxes, strict=True))
+        text = f"angle_deg,current_A,flux_linkage_Wb\n{text}\n"
+        if first_deg and shift_deg == 2.0:
+            with pytest.raises(FluxMapError, match="do not tell where the poles are aligned"):
+                imported(text)
+            continue
+        result = imported(text)
+        aligned_deg, error_deg = origin_of(result)
+        assert abs(math.remainder(aligned_deg - shift_deg, PITCH_DEG)) <= max(error_deg, 0.1)
+        kept = any("kept: half a pitch" in line for line in result.lines)
+        assert kept == (first_deg > 0.0 or shift_deg == 0.0) and (kept or deviation(result) < 5e-3)
+
+
 def test_direct_map_of_half_a_pitch_with_another_origin_is_refused_and_names_the_import():
     saturating = load_machine(MACHINES / "saturating.toml").magnetics
     rows = [f"{angle:g},{current:g},{float(saturating.flux_linkage_Wb(math.radians(angle - 1.0), current)):.9g}"

@@ -13,9 +13,9 @@ to some 6 % in published maps. Twice that and more is a second machine, a wrong 
 curves would be the map of no machine. A curve that has to be changed by more than 4 % of the aligned flux linkage to be
 monotonic has a dip or a step: its torque would have the wrong sign there.
 
-On a steep flank a dip leaves the curve monotonic. Therefore its slope must rise to one maximum and fall from there, as the
-overlap of two poles makes it; what has to be changed for that is below 0.2 % in maps of field solvers and of formulae, and
-some twice the scatter of the points in one that was measured.
+On a steep flank a dip leaves the curve monotonic. Therefore its slope must rise to one maximum and fall from there, as
+the overlap of two poles makes it; what has to be changed for that is below 0.2 % in maps of field solvers and of
+formulae, and some twice the scatter of the points in one that was measured.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ REPAIR_MAX = 0.04  # for a monotonic curve, of the aligned flux linkage at that 
 BEND_MAX = 0.025  # for a slope with one maximum, likewise
 OFFSET_MAX = 0.02  # at 0 A, of the map's greatest flux linkage
 PLACE_MAX = 0.03  # of a phase from its place a stroke after the one before, of a pitch
+HALF_ERROR_RAD = 2.0 * math.pi / 80.0  # of the aligned position of half a pitch, which is shifted to 0
 GAP_RAD = math.pi / 6.0  # without points, electrical
 _TOP_STEP = 3  # of the angles that are tried as that of the greatest slope
 ANGLES_MIN = 8
@@ -262,9 +263,17 @@ def _origin(phase: _Phase) -> Origin:
     origin = find_origin(phase.angle_rad, phase.flux_Wb[:, 1:])
     kept_rad = math.pi * round(origin.aligned_rad / math.pi)
     near = abs(origin.aligned_rad - kept_rad) <= origin.error_rad
-    if near and phase.angle_rad[-1] - phase.angle_rad[0] < WHOLE_RAD:
-        return Origin(kept_rad, origin.error_rad)
-    return origin
+    return Origin(kept_rad, origin.error_rad) if near and not _is_whole(phase) else origin
+
+
+def _is_whole(phase: _Phase) -> bool:
+    """Whether the points are those of a whole pitch."""
+    return float(phase.angle_rad[-1] - phase.angle_rad[0]) >= WHOLE_RAD
+
+
+def _is_at_end(origin: Origin) -> bool:
+    """Whether the aligned position is that of an angle of 0 or of half a pitch."""
+    return math.remainder(origin.aligned_rad, math.pi) == 0.0
 
 
 def _say_origin(measured: Sequence[_Phase], origins: Sequence[Origin], pitch_deg: float, phases: int,
@@ -272,8 +281,14 @@ def _say_origin(measured: Sequence[_Phase], origins: Sequence[Origin], pitch_deg
     """The aligned position of every phase, and how far it is from its place a stroke after another."""
     deg = pitch_deg / (2.0 * math.pi)
     shown = ", ".join(f"{deg * origin.aligned_rad:.3f} +- {deg * origin.error_rad:.3f}" for origin in origins)
-    lines.append(f"origin: aligned at {shown} deg of the file (mechanical{', by phase' if len(origins) > 1 else ''}),"
-                 " shifted to 0")
+    for phase, origin in zip(measured, origins, strict=True):
+        if not _is_at_end(origin) and origin.error_rad > HALF_ERROR_RAD and not _is_whole(phase):
+            raise FluxMapError(f"line {phase.line[0, 0]}: the points of half a pitch do not tell where the poles are"
+                               f" aligned: at {deg * origin.aligned_rad:.3f} +- {deg * origin.error_rad:.3f} deg; must"
+                               f" be known within {deg * HALF_ERROR_RAD:.3f} deg; a whole pitch shows it")
+    is_kept = all(_is_at_end(origin) and not _is_whole(phase) for phase, origin in zip(measured, origins, strict=True))
+    lines.append(f"origin: aligned at {shown} deg of the file (mechanical{', by phase' if len(origins) > 1 else ''}), "
+                 + ("kept: half a pitch shows no smaller shift than that" if is_kept else "shifted to 0"))
     first = origins[0].aligned_rad
     worst_rad, at = 0.0, 0
     for number, origin in enumerate(origins):
@@ -363,8 +378,8 @@ def _compare_beyond(phase: _Phase, origin: Origin, both: tuple[np.ndarray | None
     row, column = np.unravel_index(int(np.argmax(difference)), difference.shape)
     if difference[row, column] > ASYMMETRY_MAX:
         raise FluxMapError(
-            f"line {phase.line[row, column]}, {current_A[column]:.5g} A: beyond the end of half a pitch the flux linkage"
-            f" differs from its mirror image by {100.0 * difference[row, column]:.1f} % of the largest; must be within"
+            f"line {phase.line[row, column]}, {current_A[column]:.5g} A: beyond the end of half a pitch the flux"
+            f" linkage differs from its mirror image by {100.0 * difference[row, column]:.1f} % of the largest; must be within"
             f" {ASYMMETRY_MAX:.0%}")
 
 

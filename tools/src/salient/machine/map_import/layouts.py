@@ -15,7 +15,6 @@ from salient.machine.flux_map import FluxMapError
 from salient.machine.map_import.columns import Column, column, condition
 from salient.machine.map_import.text import Block, Row, number
 
-
 _TITLE_MAX = 60
 """Characters of a title that is a quantity, not a description."""
 
@@ -147,8 +146,8 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
     if len(columns) == width and {"angle", "current"} <= set(roles) and {"flux", "inductance"} & set(roles):
         _long(points, block, columns, phase)
     elif len(columns) == width and {"angle", "current", "other"} <= set(roles):
-        raise FluxMapError(f"line {block.rows[0].line}: the columns {', '.join(block.header)!r:.80} have no flux linkage"
-                           " or inductance")
+        raise FluxMapError(f"line {block.rows[0].line}: the columns {', '.join(block.header)!r:.80} have no flux"
+                           " linkage or inductance")
     elif len(columns) == width and sum(of is not None for of in conditions) >= 3:
         _by_condition(points, block, columns, conditions, phase)
     elif len(block.header) in (width, width - 1) and _is_matrix_head(block):
