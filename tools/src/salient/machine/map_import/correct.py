@@ -97,8 +97,8 @@ def correct(points: Points, rotor_poles: int, phases: int, supply: Supply) -> Im
         return _place(measured[phase], origins[phase].aligned_rad + way * grid_rad[row], column)
 
     _compare_halves(halves, most_Wb, current_A, place, lines)
-    for phase, origin, both in zip(measured, origins, halves, strict=True):
-        _compare_beyond(phase, origin, both, most_Wb, current_A)
+    for of_phase, origin, both in zip(measured, origins, halves, strict=True):
+        _compare_beyond(of_phase, origin, both, most_Wb, current_A)
     means = [np.mean([half for half in both if half is not None], axis=0) for both in halves]
     _compare_phases(means, most_Wb, current_A,
                     lambda phase, row, column: place(phase, int(halves[phase][0] is None), row, column), lines)
@@ -376,11 +376,11 @@ def _compare_beyond(phase: _Phase, origin: Origin, both: tuple[np.ndarray | None
     mirrored = CubicSpline(np.linspace(0.0, math.pi, len(half)), half)(away_rad)
     difference = np.abs(phase.flux_Wb - mirrored) / most_Wb
     row, column = np.unravel_index(int(np.argmax(difference)), difference.shape)
-    if difference[row, column] > ASYMMETRY_MAX:
+    worst = float(difference[row, column])
+    if worst > ASYMMETRY_MAX:
         raise FluxMapError(
             f"line {phase.line[row, column]}, {current_A[column]:.5g} A: beyond the end of half a pitch the flux"
-            f" linkage differs from its mirror image by {100.0 * difference[row, column]:.1f} % of the largest; must be within"
-            f" {ASYMMETRY_MAX:.0%}")
+            f" linkage differs from its mirror image by {100.0 * worst:.1f} % of the largest; must be within {ASYMMETRY_MAX:.0%}")
 
 
 def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.ndarray,
