@@ -380,7 +380,8 @@ def _compare_beyond(phase: _Phase, origin: Origin, both: tuple[np.ndarray | None
     if worst > ASYMMETRY_MAX:
         raise FluxMapError(
             f"line {phase.line[row, column]}, {current_A[column]:.5g} A: beyond the end of half a pitch the flux"
-            f" linkage differs from its mirror image by {100.0 * worst:.1f} % of the largest; must be within {ASYMMETRY_MAX:.0%}")
+            f" linkage differs from its mirror image by {100.0 * worst:.1f} % of the largest; must be within"
+            f" {ASYMMETRY_MAX:.0%}")
 
 
 def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.ndarray,
