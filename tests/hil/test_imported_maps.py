@@ -31,7 +31,7 @@ RIPPLE_MAX = 0.010  # below it no ratio is judged, as in compare
 PARTS_OF_BASE = (0.05, 1.0)
 CHECKED_FROM = 16
 ANGLES, CURRENTS = 91, 20
-KINDS = ("0.5 deg off", "2 deg off", "phases differ", "halves differ")
+KINDS = ("0.5 deg off", "2 deg off", "phases differ", "halves differ", "half a pitch, 0.5 deg off")
 
 
 def currents(machine: Machine) -> np.ndarray:
@@ -65,10 +65,12 @@ def right_map(source: Path, machine: Machine, folder: Path) -> Path:
 
 
 def table(machine: Machine, kind: str) -> str:
-    """A table over a whole pitch, in mechanical degrees."""
+    """A table over a whole or half a pitch, in mechanical degrees."""
     pitch_deg = 360.0 / machine.rotor_poles
     angles_deg, currents_A = np.linspace(0.0, pitch_deg, ANGLES), currents(machine)
-    shift_deg = {"0.5 deg off": 0.5, "2 deg off": 2.0}.get(kind, 0.0)
+    if kind.startswith("half a pitch"):
+        angles_deg = angles_deg[: ANGLES // 2 + 1]
+    shift_deg = 0.5 if "0.5 deg off" in kind else 2.0 if "2 deg off" in kind else 0.0
     lines = ["phase,angle_deg,current_A,flux_linkage_Wb"]
     for phase, gain in enumerate((0.97, 1.0, 1.03) if kind == "phases differ" else (1.0,)):
         at_deg = angles_deg - shift_deg - phase * pitch_deg / machine.phases

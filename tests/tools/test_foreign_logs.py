@@ -57,6 +57,12 @@ S = 1_000_000_000
          [(-S // 4, 0x11, b"")]),
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " 1.0 " + FD.format(3000) + "\n",
          [(S, 0x181, bytes(range(1, 9)))]),
+        ("a.asc", ASC_HEADER.format("hex", "absolute") + " 1.0 1  J1939TP FEE3p 6 0 0 - Rx d 9 A0 0F A6 60 3B D 4 1 2\n"
+         " 1.5 1 11 Rx d 1 a5 Length = 1 BitCount = 2 ID = 17\n", [(3 * S // 2, 0x11, b"\xa5")]),
+        ("a.asc", ASC_HEADER.format("hex", "absolute") + " 1.0 1 11 Rx d 10" + 16 * " 2a" + "\n",
+         [(S, 0x11, 16 * b"*")]),
+        ("a.asc", ASC_HEADER.format("hex", "absolute") + " 1.0 CANFD 1 Rx 11 0 1 9 12" + 12 * " 2a" + " 1 1 0 0 0\n",
+         [(S, 0x11, 12 * b"*")]),
         ("a.asc", "date x\nbase hex  no internal events logged\n30000.5 1 0ABCDEF1x Rx d 1 a5\n",
          [(30_000_500_000_000, 0xABCDEF1, b"\xa5")]),
         ("a.trc", ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n 1) 1.5 Rx 0123 2 01 02\n",
@@ -115,6 +121,14 @@ def test_damaged_object_of_blf_costs_no_frame_before_it(tmp_path, offset, form, 
     assert len(read) == count
     assert [frame[0] for frame in read[:5]] == [number * 10_000_000 for number in range(5)]
     assert ("byte 240 " in line or "after frame 5" in line) if count < 20 else line == ""
+
+
+@pytest.mark.parametrize("reserved", [0, 4])
+def test_flexible_data_rate_frame_of_blf_may_end_with_reserved_bytes(tmp_path, reserved):
+    content = struct.pack("<HBBLLBBB5x64s", 1, 0, 15, 0x80000123, 0, 0, 3, 64, bytes(range(64))) + bytes(reserved)
+    item = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 32 + len(content), 100, 2, 0, 0, 5_000) + content
+    read, line = found(tmp_path, "a.blf", in_containers(original("blf_objects")[:144], item, 1 << 17))
+    assert (read, line) == ([(5_000, 0x123, bytes(range(64)))], "")
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".mf4"])

@@ -208,7 +208,8 @@ def _can_message2(content: bytes) -> can.Message:
 
 
 def _identified(identifier: int) -> tuple[int, bool]:
-    return identifier & ~blf.CAN_MSG_EXT, bool(identifier & blf.CAN_MSG_EXT)
+    number = identifier & 0x1FFFFFFF  # the two bits above it are reserved
+    return number, bool(identifier & blf.CAN_MSG_EXT) or number > 0x7FF
 
 
 def _classic(content: bytes) -> can.Message:
@@ -236,7 +237,7 @@ def _can_error_ext(content: bytes) -> can.Message:
 
 
 def _can_fd_message(content: bytes) -> can.Message:
-    _check_size(content, blf.CAN_FD_MSG_STRUCT.size)
+    _check_size(content, blf.CAN_FD_MSG_STRUCT.size + 4)  # reserved ones at the end, which python-can does not write
     _, flags, dlc, word, _, _, fd_flags, valid, data = blf.CAN_FD_MSG_STRUCT.unpack_from(content)
     is_fd = bool(fd_flags & blf.EDL)
     return _fd(word, dlc, data[:valid], (is_fd, bool(fd_flags & blf.BRS), bool(fd_flags & blf.ESI)), valid,

@@ -130,6 +130,9 @@ _ASC_BASE = re.compile(r"base\s+(hex|dec)\b(?:.*\btimestamps\s+(absolute|relativ
 _ASC_OTHER = re.compile(r"date\b|base\b|//|(no\s+)?internal\s+events|(begin|end)\s+trigger", re.IGNORECASE)
 _ASC_FRAME = re.compile(r"\s(?:[TR]x|TxRq)\s+[dr]\s|\bCANFD\b|\b[dr]\s+\d\s+(?:[\dA-F]{2}\s+){2}", re.IGNORECASE)
 _DIRECTIONS = ("rx", "tx", "txrq")
+_ASC_OTHER_PROTOCOLS = ("j1939tp",)
+"""Events of a channel with a direction and data that are no frames: what was put together of several."""
+_FLEXIBLE_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 
 
 class _Asc:
@@ -170,6 +173,8 @@ class _Asc:
             return None  # of the controller, of another bus, or a system variable
         if words[1].lower().startswith("errorframe"):
             return can.Message(is_error_frame=True, is_extended_id=False)
+        if words[1].lower() in _ASC_OTHER_PROTOCOLS:
+            return None
         if not re.fullmatch(r"[\dA-F]+X?", words[1], re.IGNORECASE) or len(words) < 4:
             if len(words) > 3 and words[2].lower() in _DIRECTIONS and words[3].lower() in ("d", "r"):
                 file.leave_out(f"line {line.number}: a frame with a name, {words[1][:_SHOWN]!r}, for its identifier")
@@ -199,9 +204,11 @@ class _Asc:
             dlc = int(words[3], self.radix)
         elif not is_remote:
             raise ValueError("its length is missing")
-        data = b"" if is_remote else self._data(words[4:], min(dlc, 8), line.is_ended)
+        is_fd = not is_remote and dlc in _FLEXIBLE_LENGTHS and all(  # of older writers, which have no word for it
+            re.fullmatch(r"[\dA-F]{1,3}", word, re.IGNORECASE) for word in (words[4 : 4 + dlc] + [""] * dlc)[:dlc])
+        data = b"" if is_remote else self._data(words[4:], dlc if is_fd else min(dlc, 8), line.is_ended)
         return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_rx=words[1].lower() == "rx",
-                           is_remote_frame=is_remote, dlc=dlc, data=data, channel=None)
+                           is_remote_frame=is_remote, is_fd=is_fd, dlc=dlc, data=data, channel=None)
 
     def _flexible(self, words: list[str]) -> can.Message:
         """CANFD channel direction identifier [name] BRS ESI code length data... duration length flags ..."""
@@ -217,7 +224,7 @@ class _Asc:
             raise ValueError("its flags or its length are none of ASC")
         data = self._data(words[at + 4 :], length)
         flags = words[at + 4 + length :][2:3]
-        is_fd = not flags or bool(int(flags[0], 16) & 0x1000)
+        is_fd = not flags or bool(int(flags[0], 16) & 0x1000) or length > 8  # some writers leave the flags at 0
         is_remote = not is_fd and bool(int(flags[0], 16) & 0x10)
         if is_fd and length > dlc2len(code):
             raise ValueError(f"its code {code} is not that of {length} data bytes")
