@@ -114,7 +114,7 @@ def blf_objects(change=None):
 @pytest.mark.parametrize(
     ("offset", "form", "value", "count"),
     [(8, "<L", 0, 5), (8, "<L", 0xFFFFFFF0, 5), (8, "<L", 96, 5), (6, "<H", 0, 5), (12, "<L", 5, 19),
-     (12, "<L", 999, 19), (16, "<L", 0, 5), (24, "<Q", 1 << 63, 5), (35, "<B", 200, 5), (35, "<B", 15, 20)],
+     (12, "<L", 999, 19), (16, "<L", 0, 5), (24, "<Q", 1 << 63, 5), (35, "<B", 200, 20), (35, "<B", 15, 20)],
 )  # fmt: skip
 def test_damaged_object_of_blf_costs_no_frame_before_it(tmp_path, offset, form, value, count):
     read, line = found(tmp_path, "a.blf", blf_objects(lambda item: struct.pack_into(form, item, offset, value)))

@@ -192,6 +192,10 @@ def _inflated(content: bytes, length: int, begin: int, is_cut: bool) -> tuple[by
 # --- objects ----------------------------------------------------------------------------------------------------------
 
 
+_CODE_MAX = 15
+"""Of a length, which has 4 bits on the bus and a byte in the file: more than that means no more."""
+
+
 def _check_size(content: bytes, size: int) -> None:
     if len(content) > size:
         raise ValueError(f"{len(content)} bytes of content instead of {size}")
@@ -217,7 +221,7 @@ def _classic(content: bytes) -> can.Message:
     identifier, is_extended = _identified(word)
     is_remote = bool(flags & blf.REMOTE_FLAG)
     return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_remote_frame=is_remote,
-                       is_rx=not flags & blf.DIR, dlc=dlc, data=b"" if is_remote else data[:dlc])
+                       is_rx=not flags & blf.DIR, dlc=min(dlc, _CODE_MAX), data=b"" if is_remote else data[:dlc])
 
 
 def _can_error(content: bytes) -> can.Message:
@@ -230,10 +234,9 @@ def _can_error_ext(content: bytes) -> can.Message:
     _check_size(content, blf.CAN_ERROR_EXT_STRUCT.size)
     members = blf.CAN_ERROR_EXT_STRUCT.unpack_from(content)
     identifier, is_extended = _identified(members[7])
-    if members[5] > 8:
-        raise ValueError(f"a length of {members[5]}")
-    return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_error_frame=True, dlc=members[5],
-                       data=members[9][: members[5]])
+    length = min(members[5], 8)
+    return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_error_frame=True, dlc=length,
+                       data=members[9][:length])
 
 
 def _can_fd_message(content: bytes) -> can.Message:
@@ -258,7 +261,8 @@ def _fd(word: int, dlc: int, data: bytes, fd_flags: tuple[bool, bool, bool], val
         ) -> can.Message:
     identifier, is_extended = _identified(word)
     is_fd, brs, esi = fd_flags
-    if dlc > 15 or valid > 64 or valid > (dlc2len(dlc) if is_fd else 8):
+    dlc = min(dlc, _CODE_MAX)
+    if valid > (dlc2len(dlc) if is_fd else 8):
         raise ValueError(f"{valid} data bytes with the code {dlc}")
     return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_remote_frame=is_remote, is_rx=is_rx,
                        is_fd=is_fd, bitrate_switch=is_fd and brs, error_state_indicator=is_fd and esi,
