@@ -329,11 +329,13 @@ def _half(phase: _Phase, aligned_rad: float, way: float, grid_rad: np.ndarray) -
     # Beyond its ends, the other half where the file has it, else the mirror image.
     near = (away_rad >= -GAP_RAD) & (away_rad <= math.pi + GAP_RAD)
     x, y = away_rad[near], flux_Wb[near]
+    # Two points at nearly one angle, of which the error of the origin moves one, would be a kink.
+    apart_rad = 0.25 * float(np.median(np.diff(at)))
     if x[0] > -0.5 * GAP_RAD:
-        mirrored = own & (away_rad > max(1e-6, -x[0] + 1e-6)) & (away_rad < 2.0 * GAP_RAD)
+        mirrored = own & (away_rad > max(1e-6, -x[0] + apart_rad)) & (away_rad < 2.0 * GAP_RAD)
         x, y = np.append(-away_rad[mirrored], x), np.concatenate([flux_Wb[mirrored], y])
     if x[-1] < math.pi + 0.5 * GAP_RAD:
-        mirrored = own & (away_rad > math.pi - 2.0 * GAP_RAD) & (2.0 * math.pi - away_rad > x[-1] + 1e-6)
+        mirrored = own & (away_rad > math.pi - 2.0 * GAP_RAD) & (2.0 * math.pi - away_rad > x[-1] + apart_rad)
         x, y = np.append(x, 2.0 * math.pi - away_rad[mirrored]), np.concatenate([y, flux_Wb[mirrored]])
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
