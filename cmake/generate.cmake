@@ -20,10 +20,10 @@ if(SALIENT_MACHINE_FILE)
 endif()
 
 # salient_generate_codec(TARGET DBC [INTEGER] [NODE name]): a static library with <name>_codec.h/.c generated from DBC.
-# INTEGER leaves every floating-point conversion out. NODE adds <name>_enumerations.h, and <name>_telemetry.h/.c with the
+# INTEGER leaves every floating-point conversion out. PHASES leaves messages out that only machines of more phases have. NODE adds <name>_enumerations.h, and <name>_telemetry.h/.c with the
 # cyclic messages of that node.
 function(salient_generate_codec target dbc)
-    cmake_parse_arguments(ARG "INTEGER" "NODE" "" ${ARGN})
+    cmake_parse_arguments(ARG "INTEGER" "NODE;PHASES" "" ${ARGN})
     get_filename_component(name ${dbc} NAME_WE)
     set(out ${CMAKE_CURRENT_BINARY_DIR}/codec)
     set(outputs ${out}/${name}_codec.c ${out}/${name}_codec.h)
@@ -31,6 +31,9 @@ function(salient_generate_codec target dbc)
     set(flags)
     if(ARG_INTEGER)
         list(APPEND flags --integer)
+    endif()
+    if(ARG_PHASES)
+        list(APPEND flags --phases ${ARG_PHASES})
     endif()
     if(ARG_NODE)
         list(APPEND flags --node ${ARG_NODE})

@@ -19,7 +19,11 @@
 
 typedef struct hal hal_t;
 
-/* Maximum number of phases of a port; a drive uses the first `phases` of its machine. */
-#define HAL_PHASES_MAX 4
+/* Maximum number of phases of a port, 4 or 6; a drive uses the first `phases` of its machine. The host's programs serve
+ * every machine. An image for a board is compiled with 4 for a machine of up to four phases: what lies behind an array
+ * of phases is as near as it can be. */
+#ifndef HAL_PHASES_MAX
+#define HAL_PHASES_MAX 6
+#endif
 
 #endif

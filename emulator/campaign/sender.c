@@ -336,7 +336,9 @@ static void send_clients(transport_t *transport, uint64_t time_ns, transport_ori
         sender->on_command(sender->context, time_ns, &meaning);
     } else if (origin == TRANSPORT_FROM_EMULATOR) {
         if (frame->classic.can_id == (RIG_TRUTH_FAULT_FRAME_ID | CAN_EFF_FLAG)) {
-            sender->on_fault(sender->context, time_ns, frame->classic.data[0], frame->classic.data[2] & 1u);
+            struct rig_truth_fault_t fault;
+            rig_truth_fault_unpack(&fault, frame->classic.data, RIG_TRUTH_FAULT_LENGTH);
+            sender->on_fault(sender->context, time_ns, fault.kind, fault.present);
         } else {
             listen(sender, &frame->classic, time_ns);
         }

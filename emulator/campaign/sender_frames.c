@@ -138,9 +138,9 @@ void sender_put_events(sender_t *sender, const transport_receiver_t *receiver) {
                 put_bench(sender, receiver, RIG_SET_FRAME_ID, (uint8_t)event->what,
                           (uint32_t)(end ? event->raw_end : event->raw), at_us);
             } else {
-                const uint32_t place = event->phase | event->leg << 2 | (end ? 0u : 8u);
-                put_bench(sender, receiver, RIG_FAULT_FRAME_ID, (uint8_t)event->what,
-                          place | ((uint32_t)event->raw & 0xFFFFFu) << 4, at_us);
+                const uint32_t bits = event->what | event->phase << 7 | event->leg << 10 | (end ? 0u : 1u) << 11 |
+                                      (uint32_t)event->raw << 12;
+                put_bench(sender, receiver, RIG_FAULT_FRAME_ID, (uint8_t)bits, bits >> 8, at_us);
             }
         }
     }

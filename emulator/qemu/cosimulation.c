@@ -6,6 +6,7 @@
 #include <assert.h>
 #include <inttypes.h>
 #include <setjmp.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,7 +27,8 @@
 
 static_assert(MAILBOX_PWM_CLOCK_HZ == PWM_TIMER_CLOCK_HZ, "one clock on both sides of the mailbox");
 
-static mailbox_t *mailbox;
+static uint8_t *shared; /* the image's mailbox: that below, with its arrays of phases */
+static mailbox_t copy_of_shared, *const mailbox = &copy_of_shared;
 static simulation_t simulation;
 static hal_t host = {.board = &simulation.rigs[0].board}; /* the host port checks the calling context */
 static bool rejected, started;
@@ -41,6 +43,43 @@ static void resume_drive(void) {
         _longjmp(drive_context, 1);
     }
 }
+
+/* --- Mailbox of an image that is compiled for fewer phases --- */
+
+#define IMAGE_PHASES 4 /* those of an image for a machine of no more */
+#define PER_PHASE sizeof(uint16_t)
+
+static_assert(sizeof mailbox->compare.upper == HAL_PHASES_MAX * PER_PHASE &&
+                  sizeof mailbox->temperature_code == 2 * HAL_PHASES_MAX * PER_PHASE,
+              "arrays of phases have elements of one size");
+
+/* Where the arrays of phases begin; nothing is padded behind them. */
+static const size_t phase_arrays[] = {
+    offsetof(mailbox_t, adc.phase_current_counts),
+    offsetof(mailbox_t, compare.upper),
+    offsetof(mailbox_t, compare.lower),
+    offsetof(mailbox_t, temperature_code) + HAL_ADC_WINDING *PER_PHASE,
+    offsetof(mailbox_t, temperature_code) + HAL_ADC_INVERTER *PER_PHASE,
+};
+
+/* Copies the mailbox from (or to) the image, but for the elements of phases that the image does not have. */
+static void exchange(bool to_image) {
+    const bool fewer = simulation.image.machine.phases <= IMAGE_PHASES;
+    const size_t left_out = fewer ? (HAL_PHASES_MAX - IMAGE_PHASES) * PER_PHASE : 0;
+    uint8_t *own = (uint8_t *)mailbox, *of_image = shared;
+    const uint8_t *const end = own + sizeof *mailbox;
+    for (unsigned i = 0; own < end; i++) {
+        const bool last = i == sizeof phase_arrays / sizeof phase_arrays[0];
+        const uint8_t *const next =
+            last ? end : (uint8_t *)mailbox + phase_arrays[i] + HAL_PHASES_MAX * PER_PHASE - left_out;
+        const size_t size = (size_t)(next - own);
+        memcpy(to_image ? of_image : own, to_image ? own : of_image, size);
+        of_image += size;
+        own += size + (last ? 0 : left_out);
+    }
+}
+
+/* --- Events --- */
 
 /* Registers as of now. */
 static void update_registers(void) {
@@ -146,8 +185,8 @@ static void run_to_trigger(void) {
     }
 }
 
-bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) {
-    mailbox = shared;
+bool cosimulation_open(mailbox_t *of_image, const options_t *options, bool timed) {
+    shared = (uint8_t *)of_image;
     if (options->drives > 1) {
         fprintf(stderr, "salient: --drives %" PRIu32 ": only one with an image\n", options->drives);
         return false;
@@ -155,7 +194,8 @@ bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) 
     if (!simulation_open(&simulation, options)) {
         return false;
     }
-    mailbox->layout = MAILBOX_LAYOUT;
+    mailbox->layout =
+        MAILBOX_LAYOUT_OF(simulation.image.machine.phases <= IMAGE_PHASES ? IMAGE_PHASES : HAL_PHASES_MAX);
     mailbox->control_rate_hz = options->control_rate_hz;
     mailbox->controller = options->controller_index;
     mailbox->node = options->node;
@@ -164,6 +204,7 @@ bool cosimulation_open(mailbox_t *shared, const options_t *options, bool timed) 
     mailbox->encoder_bits = hal_encoder_bits(&host);
     mailbox->timed = timed;
     update_registers();
+    exchange(true);
     return true;
 }
 
@@ -249,6 +290,7 @@ static bool serve_hal(mailbox_command_t command) {
 }
 
 void cosimulation_serve(void) {
+    exchange(false);
     if (mailbox->compare_written) {
         mailbox->compare_written = 0;
         hal_pwm_write(&host, &mailbox->compare);
@@ -258,4 +300,5 @@ void cosimulation_serve(void) {
         fprintf(stderr, "salient: the drive sent the unknown command %u\n", (unsigned)command);
         abort();
     }
+    exchange(true);
 }

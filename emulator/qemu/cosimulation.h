@@ -19,7 +19,7 @@
 
 /* Opens the simulation and fills the mailbox, before the drive starts; timed: instructions take time. Keeps both.
  * False, after one line on stderr, on failure. */
-bool cosimulation_open(mailbox_t *mailbox, const options_t *options, bool timed);
+bool cosimulation_open(mailbox_t *of_image, const options_t *options, bool timed);
 
 /* Closes the simulation of a drive that ended before MAILBOX_EXIT. */
 void cosimulation_abandon(void);

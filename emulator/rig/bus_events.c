@@ -27,11 +27,11 @@ void bus_event(void *context, uint64_t now_ns) {
 
 void truth_event(void *context, uint64_t now_ns) {
     rig_t *rig = context;
-    transport_frame_t frames[TRUTH_FRAMES];
+    transport_frame_t frames[TRUTH_FRAMES_MAX];
     rig->scheduler.due_ns[EVENT_TRUTH] += rig->truth_period_ns;
     plant_advance(&rig->plant, now_ns);
-    truth_pack(&rig->plant, &rig->heat, frames);
-    for (unsigned i = 0; i < TRUTH_FRAMES; ++i) {
+    const unsigned count = truth_pack(&rig->plant, &rig->heat, frames);
+    for (unsigned i = 0; i < count; ++i) {
         transport_frame_set_node(&frames[i], rig->config.node);
         transport_send(rig->config.transport, now_ns, TRANSPORT_FROM_EMULATOR, &frames[i]);
     }

@@ -18,8 +18,8 @@ _Static_assert(FAULT_COUNT <= FAULT_KINDS_MAX, "room for every kind");
 
 /* Kind and place of a fault as one number, for the queue. */
 static unsigned pack(const fault_request_t *request) {
-    return request->kind | (unsigned)request->phase << 8 | (unsigned)request->leg << 10 |
-           (unsigned)request->begins << 11;
+    return request->kind | (unsigned)request->phase << 8 | (unsigned)request->leg << 11 |
+           (unsigned)request->begins << 12;
 }
 
 void faults_init(rig_t *rig) {
@@ -269,8 +269,8 @@ static const effect_t effects[FAULT_COUNT] = {
 /* --- Requests --- */
 
 static void change(rig_t *rig, unsigned packed, double attribute) {
-    const unsigned kind = packed & 0xFFu, phase = packed >> 8 & 3u, leg = packed >> 10 & 1u;
-    const bool begins = packed >> 11 & 1u;
+    const unsigned kind = packed & 0xFFu, phase = packed >> 8 & 7u, leg = packed >> 11 & 1u;
+    const bool begins = packed >> 12 & 1u;
     rig->faults.present[kind][phase][leg] = (fault_presence_t){.present = begins, .value = attribute};
     plant_advance(&rig->plant, rig->board.time_ns);
     effects[kind](rig);

@@ -26,11 +26,19 @@ enum {
     LOG_VOLTAGE,
     LOG_CURRENT,
     LOG_TORQUE,
-    LOG_CURRENT_A,
-    LOG_ANGLE = LOG_CURRENT_A + HAL_PHASES_MAX,
+    LOG_CURRENT_A, /* of four phases */
+    LOG_ANGLE = LOG_CURRENT_A + 4,
     LOG_SELF_TEST,
-    LOG_PHASES
+    LOG_PHASES,
+    LOG_CURRENT_E /* of the others */
 };
+
+/* Phase whose current a part of a fault has; HAL_PHASES_MAX or more: none. */
+static unsigned phase_of(unsigned part) {
+    return part >= LOG_CURRENT_A && part < LOG_ANGLE ? part - LOG_CURRENT_A
+           : part >= LOG_CURRENT_E                   ? part - LOG_CURRENT_E + 4
+                                                     : HAL_PHASES_MAX;
+}
 
 static uint16_t largest(const uint16_t *current_q9) {
     uint16_t largest_q9 = 0;
@@ -107,17 +115,17 @@ static bool fault_part(const nvm_store_fault_t *fault, unsigned part, int32_t *v
         *value = fault->angle;
         break;
     case LOG_SELF_TEST:
-        *value = fault->self_test;
+        *value = (int32_t)(fault->self_test | (uint32_t)fault->sensors << 16);
         break;
     case LOG_PHASES:
         *value = fault->phases;
         break;
     default:
-        if (part < LOG_ANGLE) {
-            *value = fault->current_q9[part - LOG_CURRENT_A];
-            break;
+        if (phase_of(part) >= HAL_PHASES_MAX) {
+            return false;
         }
-        return false;
+        *value = fault->current_q9[phase_of(part)];
+        break;
     }
     return true;
 }

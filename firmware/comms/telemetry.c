@@ -3,6 +3,7 @@
 #include <assert.h>
 
 #include "comms/counter.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "drive_enumerations.h"
 #include "fixed/compiler.h"
@@ -62,6 +63,7 @@ static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t gro
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
         const bool settable = message->rate != DRIVE_TELEMETRY_RATE_FIXED;
         if (message->group == group && (telemetry->in_fault || !message->if_active) &&
+            machine_tables.phases > message->phases_above &&
             count_down(&telemetry->countdown[i], settable ? telemetry->period[message->rate] : message->period)) {
             due[count++] = message;
         }

@@ -3,13 +3,15 @@
 #include <stddef.h>
 
 #include "comms/units.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* Items of a period, two in a part, as drive.dbc lists them. */
-enum { DC_LINK_VOLTAGE = HAL_PHASES_MAX, ANGLE, SPEED, TORQUE_REFERENCE, UPPER };
-enum { LOWER = UPPER + HAL_PHASES_MAX, ITEMS = LOWER + HAL_PHASES_MAX };
+/* Items of a period, two in a part, as drive.dbc lists them: those of the first phases, then those of the others. */
+enum { FIRST_PHASES = 4, MORE_PHASES = 2 };
+enum { DC_LINK_VOLTAGE = FIRST_PHASES, ANGLE, SPEED, TORQUE_REFERENCE, UPPER };
+enum { LOWER = UPPER + FIRST_PHASES, FIRST_ITEMS = LOWER + FIRST_PHASES, ITEMS = FIRST_ITEMS + 3 * MORE_PHASES };
 
 /* As measure.c. */
 static int32_t scaled(uint16_t counts, int32_t scale_q18) {
@@ -20,8 +22,27 @@ static int32_t duty_q15(const control_parameters_t *parameters, uint16_t compare
     return (int32_t)fixed_divide((int64_t)compare << 15, parameters->period_ticks);
 }
 
+static int32_t current_q9(const control_parameters_t *parameters, const fault_trace_period_t *period, unsigned phase) {
+    return scaled(period->adc.phase_current_counts[phase], parameters->current_scale_q18);
+}
+
+static uint16_t item_of_more(const control_parameters_t *parameters, const fault_trace_period_t *period,
+                             unsigned number) {
+    const unsigned quantity = number / MORE_PHASES, phase = FIRST_PHASES + number % MORE_PHASES;
+    if (phase >= HAL_PHASES_MAX) {
+        return 0;
+    }
+    if (quantity == 0) {
+        return (uint16_t)current_q9(parameters, period, phase);
+    }
+    return (uint16_t)duty_q15(parameters, quantity == 1 ? period->compare.upper[phase] : period->compare.lower[phase]);
+}
+
 static uint16_t item(const control_parameters_t *parameters, const fault_trace_period_t *period, unsigned number) {
     int32_t value = 0;
+    if (number >= FIRST_ITEMS) {
+        return item_of_more(parameters, period, number - FIRST_ITEMS);
+    }
     if (number >= LOWER) {
         value = duty_q15(parameters, period->compare.lower[number - LOWER]);
     } else if (number >= UPPER) {
@@ -35,7 +56,7 @@ static uint16_t item(const control_parameters_t *parameters, const fault_trace_p
     } else if (number == DC_LINK_VOLTAGE) {
         value = scaled(period->adc.bus_voltage_counts, parameters->voltage_scale_q18);
     } else {
-        value = scaled(period->adc.phase_current_counts[number], parameters->current_scale_q18);
+        value = current_q9(parameters, period, number);
     }
     return (uint16_t)value;
 }
@@ -51,8 +72,9 @@ bool trace_protocol_respond(const fault_trace_t *trace, const control_parameters
                                                   .index = request.index,
                                                   .part = request.part,
                                                   .status = PARAMETER_STATUS_NO_SUCH_ENTRY};
+    const unsigned items = machine_tables.phases > FIRST_PHASES ? ITEMS : FIRST_ITEMS;
     const fault_trace_period_t *period = fault_trace_period(trace, request.index);
-    if (period != NULL && request.part < ITEMS / 2) {
+    if (period != NULL && request.part < items / 2u) {
         const uint32_t low = item(parameters, period, 2u * request.part);
         const uint32_t high = item(parameters, period, 2u * request.part + 1u);
         response.value = (int32_t)(high << 16 | low);

@@ -95,7 +95,7 @@ typedef struct {
 #define MACHINE_PARAMETERS_MAX 64
 
 typedef struct {
-    uint8_t phases;            /* 3 or 4 */
+    uint8_t phases;            /* 3 to 6 */
     uint8_t rotor_poles;       /* electrical revolutions per mechanical revolution */
     uint8_t speed_exponent;    /* w, 0..3 */
     uint16_t current_range_q9; /* full scale of the current sensors, A, unsigned Q7.9 */

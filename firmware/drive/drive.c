@@ -198,6 +198,7 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
         fault_record_t record = drive->control.state_machine.record;
         hal_critical_leave(drive->hal);
         record.self_test = telemetry_self_test(drive);
+        record.sensors = telemetry_sensors_e_f(drive);
         record.phases = (uint8_t)drive->flux.phases;
         nvm_store_follow_fault(&drive->store, record.fault == FAULT_NONE ? NULL : &record);
     } else {

@@ -3,6 +3,7 @@
 #include "comms/units.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
+#include "fixed/divide.h"
 #include "fixed/fixed.h"
 #include "interrupts/deferred.h"
 #include "interrupts/speed_control.h"
@@ -31,12 +32,36 @@ static int32_t misalignment(const drive_t *drive) {
     for (int32_t phase = 0; phase < phases; phase++) {
         sum += drive->control.deferred.misalignment.phase[phase].offset;
     }
-    return (int32_t)sum / (phases * machine_tables.rotor_poles);
+    return (int32_t)fixed_divide(sum, phases * machine_tables.rotor_poles);
 }
 
 uint16_t telemetry_self_test(const drive_t *drive) {
-    return (uint16_t)(drive->temperature.failed_sensors | drive->self_test.failed << SELF_TEST_TELEMETRY_BIT);
+    const uint8_t *sensors = drive->temperature.failed_sensors;
+    const unsigned winding = sensors[TEMPERATURE_WINDING] & 0xFu, inverter = sensors[TEMPERATURE_INVERTER] & 0xFu;
+    return (uint16_t)(winding | inverter << 4 | drive->self_test.failed << SELF_TEST_TELEMETRY_BIT);
 }
+
+uint8_t telemetry_sensors_e_f(const drive_t *drive) {
+    const uint8_t *sensors = drive->temperature.failed_sensors;
+    return (uint8_t)((sensors[TEMPERATURE_WINDING] >> 4 & 3u) | (sensors[TEMPERATURE_INVERTER] >> 4 & 3u) << 2);
+}
+
+#if HAL_PHASES_MAX > 4 /* otherwise the drive has no such message */
+static void collect_phases_e_f(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const int32_t *current_q9 = drive->control.measurement.current_q9;
+    const unsigned sensors = telemetry_sensors_e_f(drive);
+    telemetry->phases_e_f.current_e_a = (uint32_t)current_q9[4];
+    telemetry->phases_e_f.current_f_a = (uint32_t)current_q9[5];
+    telemetry->phases_e_f.phase_e = drive->flux.phases >> 4 & 1u;
+    telemetry->phases_e_f.phase_f = drive->flux.phases >> 5 & 1u;
+    telemetry->phases_e_f.lost_phase_e = drive->degraded.lost >> 4 & 1u;
+    telemetry->phases_e_f.lost_phase_f = drive->degraded.lost >> 5 & 1u;
+    telemetry->phases_e_f.winding_sensor_e = sensors & 1u;
+    telemetry->phases_e_f.winding_sensor_f = sensors >> 1 & 1u;
+    telemetry->phases_e_f.inverter_sensor_e = sensors >> 2 & 1u;
+    telemetry->phases_e_f.inverter_sensor_f = sensors >> 3 & 1u;
+}
+#endif
 
 static bool is_speed_limited(const drive_t *drive) {
     const command_t *command = &drive->command;
@@ -173,6 +198,9 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->self_test = telemetry_self_test(drive);
 
     collect_degraded(drive, telemetry);
+#if HAL_PHASES_MAX > 4
+    collect_phases_e_f(drive, telemetry);
+#endif
 
     collect_estimates(drive, telemetry);
 

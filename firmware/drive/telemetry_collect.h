@@ -14,4 +14,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
 /* Bits of DRIVE_SELF_TEST: failed temperature sensors, and above them SELF_TEST_*. */
 uint16_t telemetry_self_test(const drive_t *drive);
 
+/* Failed temperature sensors of phases e and f, in the order of DRIVE_PHASES_E_F from bit 0 on. [background] */
+uint8_t telemetry_sensors_e_f(const drive_t *drive);
+
 #endif

@@ -1,5 +1,7 @@
 #include "monitors/temperature.h"
 
+#include <string.h>
+
 #include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
@@ -27,12 +29,13 @@ COLD void temperature_init(temperature_t *temperature, uint32_t time_us) {
 }
 
 /* The highest valid reading of a part; not below the one before while a reading is not valid. */
-static int32_t read_part(temperature_t *temperature, const hal_t *hal, unsigned first, unsigned phases,
-                         int32_t before) {
+static int32_t read_part(temperature_t *temperature, const hal_t *hal, temperature_part_t part, unsigned phases) {
+    const unsigned first = part == TEMPERATURE_WINDING ? HAL_ADC_WINDING : HAL_ADC_INVERTER;
+    const int32_t before = temperature->hottest[part];
     int32_t hottest = 0;
-    for (unsigned sensor = first; sensor < first + phases; sensor++) {
-        const uint16_t reading = hal_adc_temperature(hal, sensor);
-        uint8_t *invalid = &temperature->invalid[sensor];
+    for (unsigned phase = 0; phase < phases; phase++) {
+        const uint16_t reading = hal_adc_temperature(hal, first + phase);
+        uint8_t *invalid = &temperature->invalid[first + phase];
         if (reading >= HAL_ADC_TEMPERATURE_CODE_MIN && reading <= HAL_ADC_TEMPERATURE_CODE_MAX) {
             *invalid = 0;
             hottest = fixed_max(reading, hottest);
@@ -43,7 +46,7 @@ static int32_t read_part(temperature_t *temperature, const hal_t *hal, unsigned 
             ++*invalid;
         }
         if (*invalid == TEMPERATURE_INVALID_MAX) {
-            temperature->failed_sensors |= (uint8_t)(1u << sensor);
+            temperature->failed_sensors[part] |= (uint8_t)(1u << phase);
         }
     }
     return hottest;
@@ -55,11 +58,10 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
         return;
     }
     temperature->step_us = time_us;
-    temperature->failed_sensors = 0;
+    memset(temperature->failed_sensors, 0, sizeof temperature->failed_sensors);
     int32_t least_room = DERATE_CODES;
-    for (unsigned part = 0; part < TEMPERATURE_PARTS; part++) {
-        const unsigned first = part == TEMPERATURE_WINDING ? HAL_ADC_WINDING : HAL_ADC_INVERTER;
-        const int32_t hottest = read_part(temperature, hal, first, phases, temperature->hottest[part]);
+    for (temperature_part_t part = 0; part < TEMPERATURE_PARTS; part++) {
+        const int32_t hottest = read_part(temperature, hal, part, phases);
         const int32_t room = parameters->limit[part] - hottest;
         temperature->hottest[part] = hottest;
         temperature->hot[part] = temperature->hot[part] ? room < DERATE_CODES : room <= 0;
@@ -70,7 +72,9 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
 }
 
 COLD uint32_t temperature_faults(const temperature_t *temperature) {
+    const uint8_t *sensors = temperature->failed_sensors;
+    const unsigned failed = sensors[TEMPERATURE_WINDING] | sensors[TEMPERATURE_INVERTER];
     return (temperature->hot[TEMPERATURE_WINDING] ? (uint32_t)FAULT_BIT(FAULT_WINDING_OVERLOAD) : 0) |
            (temperature->hot[TEMPERATURE_INVERTER] ? (uint32_t)FAULT_BIT(FAULT_INVERTER_OVERLOAD) : 0) |
-           (temperature->failed_sensors != 0 ? (uint32_t)FAULT_BIT(FAULT_TEMPERATURE_SENSOR) : 0);
+           (failed != 0 ? (uint32_t)FAULT_BIT(FAULT_TEMPERATURE_SENSOR) : 0);
 }

@@ -29,12 +29,12 @@ typedef struct {
 } temperature_parameters_t;
 
 typedef struct {
-    uint32_t step_us;                      /* the last one */
-    uint8_t invalid[HAL_ADC_TEMPERATURES]; /* readings in succession */
-    uint8_t failed_sensors;                /* bit of a number of hal_adc.h */
-    bool hot[TEMPERATURE_PARTS];           /* the faults */
-    int32_t hottest[TEMPERATURE_PARTS];    /* code */
-    int32_t torque_limit_q24;              /* of the torque reference's magnitude, N m, Q7.24: 0..torque_max_q24 */
+    uint32_t step_us;                          /* the last one */
+    uint8_t invalid[HAL_ADC_TEMPERATURES];     /* readings in succession */
+    uint8_t failed_sensors[TEMPERATURE_PARTS]; /* bit of a phase */
+    bool hot[TEMPERATURE_PARTS];               /* the faults */
+    int32_t hottest[TEMPERATURE_PARTS];        /* code */
+    int32_t torque_limit_q24;                  /* of the torque reference's magnitude, N m, Q7.24: 0..torque_max_q24 */
 } temperature_t;
 
 /* Derives the parameters: any values within the limits of the table. */

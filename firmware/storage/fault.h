@@ -24,6 +24,7 @@ typedef struct {
     uint16_t self_test; /* failed checks, bits of DRIVE_SELF_TEST; this and the next for the log only */
     uint8_t phases;     /* of a fault of phases, bits */
     uint8_t state;      /* drive_state_t in that tick */
+    uint8_t sensors;    /* failed temperature sensors of phases e and f, for the log only */
 } fault_record_t;
 
 #endif

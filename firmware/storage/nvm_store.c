@@ -96,6 +96,7 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
         .angle = record->angle,
         .self_test = record->self_test,
         .phases = record->phases,
+        .sensors = record->sensors,
     };
     memcpy(entry->current_q9, record->current_q9, sizeof entry->current_q9);
 }

@@ -27,7 +27,7 @@
 /* Faults that wait for being written: none is written in RUN. A further one is lost. */
 #define NVM_STORE_WAITING_MAX 2
 
-/* A fault in the log. 40 bytes, a multiple of a word of the memory. */
+/* A fault in the log: a multiple of a word of the memory, 40 bytes with four phases, 48 with six. */
 typedef struct {
     uint32_t start;                      /* number of the start, from 1 */
     uint32_t time_us;                    /* since that start, modulo 2^32 */
@@ -42,7 +42,10 @@ typedef struct {
     uint16_t angle;                      /* rotor, 2^-16 rev */
     uint16_t self_test; /* failed checks, bits of DRIVE_SELF_TEST; this and the next soon after that tick */
     uint8_t phases;     /* of a fault of phases, bits */
-    uint8_t reserved;   /* 0 */
+    uint8_t sensors;    /* failed temperature sensors of phases e and f, as in DRIVE_PHASES_E_F */
+#if HAL_PHASES_MAX > 4
+    uint32_t reserved; /* 0 */
+#endif
 } nvm_store_fault_t;
 
 typedef enum {

@@ -21,8 +21,10 @@
 #include "hal_nvm.h"
 #include "hal_pwm.h"
 
-/* Changes with the structure, so that an image and a host with different layouts stop at the start. */
-#define MAILBOX_LAYOUT 6
+/* Changes with the structure, so that an image and a host with different layouts stop at the start. An image has arrays
+ * for the phases that it is compiled for (hal.h), the host for the most. */
+#define MAILBOX_LAYOUT_OF(phases) (7u << 8 | (phases))
+#define MAILBOX_LAYOUT MAILBOX_LAYOUT_OF(HAL_PHASES_MAX)
 
 /* Clock of the emulated PWM timer. */
 #define MAILBOX_PWM_CLOCK_HZ 200000000

@@ -182,6 +182,11 @@ uint16_t telemetry_self_test(const drive_t *from) {
     return 0;
 }
 
+uint8_t telemetry_sensors_e_f(const drive_t *from) {
+    (void)from;
+    return 0;
+}
+
 /* No checks of the background: they would read the pattern. */
 thermal_parameters_t thermal_configure(const int32_t *values) {
     (void)values;

@@ -26,8 +26,8 @@ BUILDS = {"saturating": (*TARGET_BUILDS, WASM_BUILD), "linear_cosine": ALL[1:], 
           "finite_element": (*TARGET_BUILDS, WASM_BUILD)}
 """Builds of a machine: every optimisation level with three and with four phases; a table changes no code but constants,
 which the linked -O2 builds fold."""
-ROW_BYTES = 16
-"""Columns of recorded compare values: two for each of four phases."""
+ROW_BYTES = 24
+"""Columns of recorded compare values: two for each of six phases."""
 
 
 def start_600(bench: Bench) -> None:
@@ -166,9 +166,9 @@ def test_machine_file_of_the_user_agrees_on_host_and_targets(traces, tmp_path):
 
 @pytest.mark.in_turns
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("name", ["smallest", "largest", "fastest"])
+@pytest.mark.parametrize("name", ["smallest", "largest", "fastest", "five_phases", "six_phases"])
 def test_machine_at_the_end_of_the_range_agrees_on_host_and_targets(traces, name, controller):
-    """Machines whose formats have other units, compiled in."""
+    """Machines whose formats have other units or which have more phases, compiled in."""
     file = ROOT / "tests" / "machines" / f"{name}.toml"
     made = traces(ALL, "start_of_any_machine", machine=str(file), controller=controller, seed=3)
     assert any(made["host"].compare_values)

@@ -18,7 +18,7 @@ from salient.experiments.campaign import command, names, report, same_bits
 from salient.experiments.campaign.cluster import compare
 from salient.experiments.campaign.command import run_campaign
 from salient.experiments.campaign.failure import classes, replay
-from salient.experiments.campaign.machines import files
+from salient.experiments.campaign.machines import files, pool_line
 from salient.experiments.campaign.runner import Programs, branches, program, run_world, serve, world
 from salient.experiments.tasks import read_results
 from salient.paths import BUILD, ROOT
@@ -49,6 +49,17 @@ def test_shards_merge_to_what_one_run_has_and_nothing_runs_twice(tmp_path: Path)
     assert (note["first"], note["seeds"], note["finished"]) == (2, 6, 6)
     assert 0 < note["cells_reached"] < note["cells"] == len(names.cells())
     assert len(note["cells_not_reached"]) == note["cells"] - note["cells_reached"]
+
+
+@pytest.mark.in_turns
+def test_worlds_of_machines_of_five_and_six_phases_break_no_rule(tmp_path: Path) -> None:
+    pool = tmp_path / "machines.txt"
+    machines = [ROOT / "tests" / "machines" / f"{name}.toml" for name in ("five_phases", "six_phases")]
+    pool.write_text("".join(f"{pool_line(machine)}\n" for machine in machines), encoding="utf-8")
+    done = subprocess.run([program(), "--machines", pool, "--first", "1", "--seeds", "12"], capture_output=True,
+                          text=True, check=True)
+    results = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(results) == 12 and [result["violations"] for result in results] == [[]] * 12
 
 
 @pytest.mark.in_turns

@@ -40,9 +40,9 @@ def test_every_kind_is_described_and_has_an_effect_in_the_bench() -> None:
 def test_a_frame_has_place_and_attribute_in_its_bits() -> None:
     message = rig_database().get_message_by_name("RIG_FAULT")
     data = message.encode(fault_signals("current_sensor_offset", {"phase": "c", "offset_A": -1.5}, True, 70_000))
-    assert data == bytes([15, (-1500 & 0xF) << 4 | 1 << 3 | 2, -1500 >> 4 & 0xFF, -1500 >> 12 & 0xFF, 0x70, 0x11, 1, 0])
+    assert data == bytes([15, (-1500 & 0xF) << 4 | 1 << 3 | 1, -1500 >> 4 & 0xFF, -1500 >> 12 & 0xFF, 0x70, 0x11, 1, 0])
     data = message.encode(fault_signals("switch_open", {"phase": "b", "leg": "high"}, False, 0))
-    assert data == bytes([2, 1 << 2 | 1, 0, 0, 0, 0, 0, 0])
+    assert data == bytes([1 << 7 | 2, 1 << 2, 0, 0, 0, 0, 0, 0])
 
 
 def test_table_has_every_kind_with_its_range() -> None:

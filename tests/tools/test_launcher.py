@@ -168,8 +168,9 @@ def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
     [
         ("resistance_ohm", "resistence_ohm", ["winding.resistence_ohm", "unknown key", "resistance_ohm"]),
         ("inertia_kg_m2 = 0.02", "inertia_kg_m2 = -0.02", ["mechanics.inertia_kg_m2", "-0.02"]),
-        ("stator = 6", "stator = 7", ["poles", "6/4, 8/6, 12/8"]),
-        ("stator = 6", "stator = 6.0", ["poles", "6.0/4", "6/4, 8/6, 12/8"]),
+        ("stator = 6", "stator = 7", ["poles.stator, poles.rotor", "7/4", "7 phases", "3 to 6"]),
+        ("stator = 6", "stator = 4", ["poles.stator, poles.rotor", "4/4", "1 phase,", "3 to 6"]),
+        ("stator = 6", "stator = 6.0", ["poles.stator, poles.rotor", "6.0/4", "whole numbers"]),
         ('form = "saturating"', 'form = "magic"', ["magnetics.form", "'magic'", "linear_cosine"]),
         ("[converter]", "[converter", ["not TOML"]),
     ],

@@ -159,7 +159,8 @@ def rejection(path: Path) -> str | None:
 def assert_is_a_machine(machine: Machine) -> None:
     """Finite numbers of the right sign, and magnetics of a reluctance machine."""
     assert machine.name.isidentifier()
-    assert (machine.stator_poles, machine.rotor_poles, machine.phases) in ((6, 4, 3), (8, 6, 4), (12, 8, 3))
+    assert machine.phases == machine.stator_poles // math.gcd(machine.stator_poles, machine.rotor_poles)
+    assert 3 <= machine.phases <= 6
     numbers = dataclasses.asdict(dataclasses.replace(machine, magnetics=None))
     for table in ("converter", "dc_link", "sensors", "iron_loss"):
         numbers |= {f"{table}.{key}": value for key, value in (numbers.pop(table) or {}).items()}
@@ -259,7 +260,10 @@ def other_cases() -> list[Case]:
         ("a table of two lines", GOOD + '["a\\nb"]\n', "unknown key"),
         ("arrays in arrays", "a = " + "[" * 20_000, "not TOML"),
         ("tables in tables", "[" + "a." * 20_000 + "a]\n", "unknown key"),
-        ("poles of no machine", with_value("poles", "rotor", "5"), "poles"),
+        ("poles of one phase", with_value("poles", "rotor", "6"), "poles.stator, poles.rotor: 6/6: 1 phase,"),
+        ("poles of two phases", with_value("poles", "rotor", "3"), "poles.stator, poles.rotor: 6/3: 2 phases,"),
+        ("poles of seven phases", with_value("poles", "stator", "14"), "poles.stator, poles.rotor: 14/4: 7 phases,"),
+        ("poles of a rotor too fine", with_value("poles", "rotor", "41"), "poles.stator, poles.rotor: 6/41: must"),
         ("poles the other way round", toml({**GOOD_TABLES, "poles": {"stator": "4", "rotor": "6"}}), "poles"),
         ("poles with a point", with_value("poles", "stator", "6.0"), "poles"),
         ("inductances the wrong way round", with_value("magnetics", "aligned_inductance_H", "0.5e-3"),

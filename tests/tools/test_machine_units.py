@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from salient.bus.signals import drive_database
-from salient.dbc import database_hash
+from salient.dbc import database_hash, drive_dbc_of_phases
 from salient.generate import resolution
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.image import firmware_tables
@@ -41,7 +41,7 @@ def random_exponents(count: int) -> list[Exponents]:
 def test_bundled_machines_are_in_si_units_with_the_database_and_defaults_of_the_firmware(path):
     scaling = scaling_of_file(path)
     assert scaling.exponents == Exponents()
-    assert scaling.dbc() == DRIVE_DBC.read_text()
+    assert scaling.dbc() == drive_dbc_of_phases(DRIVE_DBC.read_text(), 4)
     of_machine = {"inertia_kg_m2", "friction_Nm_s", "resistance_ohm", "speed_kp", "speed_ki", "smc_k", "smc_delta",
                   "winding_current_A", "bp_error_scale_Nm"}
     if path.stem == "finite_element":  # poles overlap later than the paper's
@@ -153,7 +153,7 @@ def test_similar_machines_have_the_same_firmware_to_the_bit(name):
 
 @pytest.mark.parametrize("exponents", random_exponents(12), ids=str)
 def test_database_in_other_units_has_the_same_frames_and_exact_factors(exponents):
-    scaled, si = database_of(drive_dbc(exponents, 3_000_000)), drive_database()
+    scaled, si = database_of(drive_dbc(exponents, 3_000_000, 4)), drive_database()
     assert [m.frame_id for m in scaled.messages] == [m.frame_id for m in si.messages]
     changed = 0
     for message, original in zip(scaled.messages, si.messages, strict=True):
@@ -171,7 +171,7 @@ def test_database_in_other_units_has_the_same_frames_and_exact_factors(exponents
 
 @pytest.mark.parametrize("exponents", random_exponents(12), ids=str)
 def test_values_survive_the_round_trip_within_half_an_lsb(exponents):
-    database = database_of(drive_dbc(exponents, 3_000_000))
+    database = database_of(drive_dbc(exponents, 3_000_000, 4))
     chance = random.Random(SEED)
     for message in database.messages:
         for _ in range(20):
@@ -191,7 +191,7 @@ def test_commands_reach_the_largest_speed_of_the_machine_and_frames_3000_rpm_at_
     path = MACHINES / "saturating.toml"
     data = scaling_of_file(path).data
     data = replace(data, speed_max_rpm=speed_max_rpm, parameters=data.parameters | {"over_speed_rpm": over_speed_rpm})
-    scaling = Scaling(data, Exponents(speed=speed_exponent))
+    scaling = Scaling(data, Exponents(speed=speed_exponent), 3)
     signal = database_of(scaling.dbc()).get_message_by_name("DRIVE_COMMAND").get_signal_by_name("speed_reference_rpm")
     assert (signal.minimum, signal.maximum) == (-limit_rpm, limit_rpm)
     assert scaling.speed_range_rpm == limit_rpm

@@ -31,19 +31,32 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
     observation_widen(&state->speed_rad_s, seen->plant->speed_rad_s, renew);
 }
 
-static void judge_currents(const observation_t *seen, const state_t *state, checker_report_t *report,
-                           const uint8_t data[8]) {
+/* Currents of the phases from one on, those that the machine has. */
+static void judge_currents(const observation_t *seen, const state_t *state, checker_report_t *report, unsigned from,
+                           const uint16_t *raw, unsigned count) {
     const world_machine_t *machine = seen->world->machine;
-    struct drive_currents_t currents;
-    drive_currents_unpack(&currents, data, 8);
-    const uint16_t raw[HAL_PHASES_MAX] = {currents.current_a_a, currents.current_b_a, currents.current_c_a,
-                                          currents.current_d_a};
-    for (unsigned phase = 0; phase < machine->image.machine.phases; phase++) {
-        const double current = raw[phase] * machine->current_lsb_A / machine->image.machine.ranges.current_A;
+    for (unsigned phase = from; phase < from + count && phase < machine->image.machine.phases; phase++) {
+        const double current = raw[phase - from] * machine->current_lsb_A / machine->image.machine.ranges.current_A;
         if (!observation_is_within(&state->current[phase], current, ERROR_MAX)) {
             checker_violated(report, phase, current);
         }
     }
+}
+
+static void judge_first_currents(const observation_t *seen, const state_t *state, checker_report_t *report,
+                                 const uint8_t data[8]) {
+    struct drive_currents_t currents;
+    drive_currents_unpack(&currents, data, 8);
+    const uint16_t raw[4] = {currents.current_a_a, currents.current_b_a, currents.current_c_a, currents.current_d_a};
+    judge_currents(seen, state, report, 0, raw, 4);
+}
+
+static void judge_other_currents(const observation_t *seen, const state_t *state, checker_report_t *report,
+                                 const uint8_t data[8]) {
+    struct drive_phases_e_f_t phases;
+    drive_phases_e_f_unpack(&phases, data, 8);
+    const uint16_t raw[2] = {phases.current_e_a, phases.current_f_a};
+    judge_currents(seen, state, report, 4, raw, 2);
 }
 
 static void judge_voltage(const observation_t *seen, const state_t *state, checker_report_t *report,
@@ -76,7 +89,9 @@ static void on_frame(const observation_t *seen, void *memory, checker_report_t *
         return;
     }
     if (frame->identifier == DRIVE_CURRENTS_FRAME_ID) {
-        judge_currents(seen, memory, report, frame->data);
+        judge_first_currents(seen, memory, report, frame->data);
+    } else if (frame->identifier == DRIVE_PHASES_E_F_FRAME_ID) {
+        judge_other_currents(seen, memory, report, frame->data);
     } else if (frame->identifier == DRIVE_TORQUE_FRAME_ID) {
         judge_voltage(seen, memory, report, frame->data);
     } else if (frame->identifier == DRIVE_MOTION_FRAME_ID) {

@@ -97,7 +97,8 @@ TEST_F(MemoryProtocol, reads_every_part_of_a_logged_fault_in_the_units_of_the_bu
     record.angle = 0xFEDC;
     record.phases = 0xA;
     record.self_test = 0x8100;
-    const uint16_t current_q9[HAL_PHASES_MAX] = {512, 40000, 3, 7};
+    record.sensors = 0x9;
+    const uint16_t current_q9[HAL_PHASES_MAX] = {512, 40000, 3, 7, 11, 13};
     std::memcpy(record.current_q9, current_q9, sizeof current_q9);
     write(record);
     const int32_t quarter_rpm = int32_t(std::lround(-10.0 * 30.0 / M_PI * 4.0));
@@ -116,8 +117,10 @@ TEST_F(MemoryProtocol, reads_every_part_of_a_logged_fault_in_the_units_of_the_bu
                                 3,
                                 7,
                                 0xFEDC,
-                                0x8100,
-                                0xA};
+                                0x98100,
+                                0xA,
+                                11,
+                                13};
     for (unsigned part = 0; part < 256; part++) {
         ASSERT_TRUE(ask(PARAMETER_OPERATION_FAULT_LOG, part, 1));
         const bool there = part < std::size(expected);

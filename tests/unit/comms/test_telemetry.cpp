@@ -458,7 +458,7 @@ TEST_F(Comms, the_identity_is_sent_in_the_middle_of_a_slow_cycle) {
             EXPECT_EQ(identity.firmware_major, SALIENT_VERSION_MAJOR);
             EXPECT_EQ(identity.firmware_minor, SALIENT_VERSION_MINOR);
             EXPECT_EQ(identity.firmware_patch, SALIENT_VERSION_PATCH);
-            EXPECT_EQ(identity.dbc_hash, DRIVE_DBC_HASH);
+            EXPECT_EQ(identity.dbc_hash, machine_tables.dbc_hash);
         }
     }
     EXPECT_EQ(cycles, (std::vector<int>{5, 105}));

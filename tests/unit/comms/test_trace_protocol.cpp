@@ -6,6 +6,7 @@
 
 extern "C" {
 #include "comms/trace_protocol.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 }
 #include "support/configured.h"
@@ -13,7 +14,7 @@ extern "C" {
 
 namespace {
 
-constexpr unsigned ITEMS = HAL_PHASES_MAX + 4 + 2 * HAL_PHASES_MAX;
+constexpr unsigned FIRST_PHASES = 4, FIRST_ITEMS = 4 + 3 * FIRST_PHASES;
 
 class TraceProtocol : public testing::Test {
   protected:
@@ -60,31 +61,56 @@ class TraceProtocol : public testing::Test {
         }
     }
 
+    void expect_every_item() {
+        record(100);
+        for (unsigned period = 0; period < FAULT_TRACE_PERIODS; period++) {
+            const unsigned k = 100 - FAULT_TRACE_PERIODS + period;
+            unsigned number = 0;
+            const auto expect_currents = [&](unsigned from, unsigned to) {
+                for (unsigned phase = from; phase < to; phase++) {
+                    EXPECT_EQ(item(period, number++), int(k + phase) * 10) << "1/51.2 A a count, Q9";
+                }
+            };
+            const auto expect_duties = [&](unsigned from, unsigned to) {
+                for (unsigned phase = from; phase < to; phase++) {
+                    EXPECT_EQ(item(period, number++), int((100 * phase + k) * 32768 / parameters.period_ticks))
+                        << "Q15";
+                }
+                for (unsigned phase = from; phase < to; phase++) {
+                    EXPECT_EQ(item(period, number++),
+                              int((parameters.period_ticks - k) * 32768 / parameters.period_ticks));
+                }
+            };
+            expect_currents(0, FIRST_PHASES);
+            EXPECT_EQ(item(period, number++), int(240 * 8 + k) * 8) << "1/8 V a count, Q6";
+            EXPECT_EQ(item(period, number++), int(k << 4)) << "2^-16 rev";
+            EXPECT_EQ(item(period, number++), std::lround(-double(k) * 30.0 / M_PI * 4.0)) << "a quarter r/min";
+            EXPECT_EQ(item(period, number++), -int(k) * 16) << "Q8";
+            expect_duties(0, FIRST_PHASES);
+            EXPECT_EQ(number, FIRST_ITEMS);
+            if (machine_tables.phases > FIRST_PHASES) {
+                expect_currents(FIRST_PHASES, HAL_PHASES_MAX);
+                expect_duties(FIRST_PHASES, HAL_PHASES_MAX);
+            }
+            EXPECT_TRUE(ask(PARAMETER_OPERATION_FAULT_TRACE, period, number / 2));
+            EXPECT_EQ(response.status, PARAMETER_STATUS_NO_SUCH_ENTRY);
+        }
+    }
+
     control_parameters_t parameters;
     fault_trace_t trace{};
     drive_parameter_response_t response{};
 };
 
 TEST_F(TraceProtocol, gives_every_item_of_the_last_64_periods_the_oldest_first) {
-    record(100);
-    for (unsigned period = 0; period < FAULT_TRACE_PERIODS; period++) {
-        const unsigned k = 100 - FAULT_TRACE_PERIODS + period;
-        unsigned number = 0;
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-            EXPECT_EQ(item(period, number++), int(k + phase) * 10) << "1/51.2 A a count, Q9";
-        }
-        EXPECT_EQ(item(period, number++), int(240 * 8 + k) * 8) << "1/8 V a count, Q6";
-        EXPECT_EQ(item(period, number++), int(k << 4)) << "2^-16 rev";
-        EXPECT_EQ(item(period, number++), std::lround(-double(k) * 30.0 / M_PI * 4.0)) << "a quarter r/min";
-        EXPECT_EQ(item(period, number++), -int(k) * 16) << "Q8";
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-            EXPECT_EQ(item(period, number++), int((100 * phase + k) * 32768 / parameters.period_ticks)) << "Q15";
-        }
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
-            EXPECT_EQ(item(period, number++), int((parameters.period_ticks - k) * 32768 / parameters.period_ticks));
-        }
-        EXPECT_EQ(number, ITEMS);
-    }
+    expect_every_item();
+}
+
+TEST_F(TraceProtocol, gives_those_of_two_phases_more_of_a_machine_that_has_them) {
+    const uint8_t phases = machine_tables.phases;
+    machine_tables.phases = 5;
+    expect_every_item();
+    machine_tables.phases = phases;
 }
 
 TEST_F(TraceProtocol, has_no_period_before_a_fault_and_no_other_period_or_part_after_it) {
@@ -96,10 +122,10 @@ TEST_F(TraceProtocol, has_no_period_before_a_fault_and_no_other_period_or_part_a
     EXPECT_EQ(status(0, 0), PARAMETER_STATUS_NO_SUCH_ENTRY);
     record(3);
     EXPECT_EQ(status(0, 0), PARAMETER_STATUS_DONE) << "zeros: before the start";
-    EXPECT_EQ(status(FAULT_TRACE_PERIODS - 1, ITEMS / 2 - 1), PARAMETER_STATUS_DONE);
+    EXPECT_EQ(status(FAULT_TRACE_PERIODS - 1, FIRST_ITEMS / 2 - 1), PARAMETER_STATUS_DONE);
     EXPECT_EQ(status(FAULT_TRACE_PERIODS, 0), PARAMETER_STATUS_NO_SUCH_ENTRY);
     EXPECT_EQ(status(255, 0), PARAMETER_STATUS_NO_SUCH_ENTRY);
-    EXPECT_EQ(status(0, ITEMS / 2), PARAMETER_STATUS_NO_SUCH_ENTRY);
+    EXPECT_EQ(status(0, FIRST_ITEMS / 2), PARAMETER_STATUS_NO_SUCH_ENTRY);
     EXPECT_EQ(status(0, 255), PARAMETER_STATUS_NO_SUCH_ENTRY);
 }
 

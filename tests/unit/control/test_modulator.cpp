@@ -116,10 +116,10 @@ TEST(Modulator, interleaved_pulses_are_exact_at_the_ends) {
 }
 
 TEST(Modulator, each_phase_has_its_duty_and_the_phases_beyond_the_number_are_unchanged) {
-    const int32_t duty_q15[HAL_PHASES_MAX] = {-32768, -16384, 16384, 32768};
+    const int32_t duty_q15[HAL_PHASES_MAX] = {-32768, -16384, 16384, 32768, 8192, -8192};
     for (const bool interleaved : {false, true}) {
         for (unsigned phases = 0; phases <= HAL_PHASES_MAX; phases++) {
-            hal_pwm_compare_t compare = {.upper = {11, 12, 13, 14}, .lower = {21, 22, 23, 24}};
+            hal_pwm_compare_t compare = {.upper = {11, 12, 13, 14, 15, 16}, .lower = {21, 22, 23, 24, 25, 26}};
             modulate(duty_q15, phases, 2500, interleaved, &compare);
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 const hal_pwm_compare_t alone = compare_of(duty_q15[phase], 2500, interleaved);

@@ -107,7 +107,8 @@ TEST_F(Temperature, third_invalid_reading_in_succession_is_a_failed_sensor_and_a
         EXPECT_EQ(faults(), 0u) << code;
         step();
         EXPECT_EQ(faults(), FAULT_BIT(FAULT_TEMPERATURE_SENSOR)) << code;
-        EXPECT_EQ(temperature.failed_sensors, 1u << (HAL_ADC_WINDING + 1));
+        EXPECT_EQ(temperature.failed_sensors[TEMPERATURE_WINDING], 1u << 1);
+        EXPECT_EQ(temperature.failed_sensors[TEMPERATURE_INVERTER], 0u);
         step(300);
         EXPECT_EQ(faults(), FAULT_BIT(FAULT_TEMPERATURE_SENSOR)) << code;
         hal.code[HAL_ADC_WINDING + 1] = code_of(25.0);
@@ -120,7 +121,7 @@ TEST_F(Temperature, codes_at_the_limits_are_valid) {
     for (const uint16_t code : {uint16_t(4096), uint16_t(61440)}) {
         hal.code[HAL_ADC_WINDING] = code;
         step(5);
-        EXPECT_EQ(temperature.failed_sensors, 0u) << code;
+        EXPECT_EQ(temperature.failed_sensors[TEMPERATURE_WINDING], 0u) << code;
     }
 }
 

@@ -8,6 +8,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "hal.h"
 #include "support/fixed_point.h"
 
 namespace reference_model {
@@ -237,7 +238,7 @@ struct own_windows_t {
 // phase, angles in electrical revolutions from 0.5 (unaligned) to 1:
 // torque(angle, A), flux(angle, A), current_of_torque(angle, N m) and current_of_flux(angle, Wb).
 template <typename machine_t> struct predictive_t {
-    static constexpr unsigned PHASES_MAX = 4;
+    static constexpr unsigned PHASES_MAX = HAL_PHASES_MAX;
     const machine_t *machine;
     unsigned phases;
     double period_s, resistance_ohm, flux_gain, current_limit_A, reserve_Nm;
@@ -374,7 +375,7 @@ template <typename machine_t> struct predictive_t {
 // Misalignment of each phase from the disturbance that the load observer sees and the slope of the tables; one phase
 // per period.
 struct misalignment_t {
-    static constexpr unsigned PHASES_MAX = 4;
+    static constexpr unsigned PHASES_MAX = HAL_PHASES_MAX;
     unsigned phases;
     double rate_1_s, filter_factor, rate_hz; // filters of 1 / (factor w0); updates in 1 s
     double settle_s = 0.15, mean_1_s = 10.0;

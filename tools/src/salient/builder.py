@@ -11,13 +11,14 @@ _WORK = re.compile(rb"-- |\[[0-9]+/[0-9]+\] (?!Re-checking globbed)")
 """Lines of CMake or Ninja when a folder is not up to date."""
 
 
-def build_preset(root: Path, folder: Path, targets: Sequence[str], log: Path, notice: Callable[[], None]) -> bool:
+def build_preset(root: Path, folder: Path, targets: Sequence[str], log: Path, notice: Callable[[], None],
+                 options: Sequence[str] = ()) -> bool:
     """Brings a build of the clone in root up to date, or its targets only, in a folder that has the name of its preset;
-    configures it first where that has not been done without a machine file of the user. Output, result and notice: as
-    run_commands."""
+    configures it first, with these options, where that has not been done without a machine file of the user. Output,
+    result and notice: as run_commands."""
     commands = [["cmake", "--build", str(folder), *(["--target", *targets] if targets else [])]]
     if not _is_configured(folder):
-        commands.insert(0, ["cmake", "--preset", folder.name, "-B", str(folder), "-DSALIENT_MACHINE_FILE="])
+        commands.insert(0, ["cmake", "--preset", folder.name, "-B", str(folder), "-DSALIENT_MACHINE_FILE=", *options])
     return run_commands(commands, root, log, notice)
 
 

@@ -21,6 +21,26 @@ def attributes(owner: Message | Signal) -> dict[str, Any]:
     return {name: attribute.value for name, attribute in owner.dbc.attributes.items()}
 
 
+def phases_above(message: Message) -> int:
+    """Only a machine of more phases than these has the message (attribute PhasesAbove); 0: every machine."""
+    return int(attributes(message).get("PhasesAbove", 0))
+
+
+PHASES = ("a", "b", "c", "d", "e", "f")
+"""Names of the phases, of which a machine has the first three to all (HAL_PHASES_MAX of the host in hal/hal.h)."""
+PHASES_MAX = len(PHASES)
+_PHASES_ABOVE = re.compile(r'^BA_ "PhasesAbove" BO_ (\d+) (\d+);', re.MULTILINE)
+
+
+def drive_dbc_of_phases(text: str, phases: int) -> str:
+    """The DBC of a drive of a machine with this number of phases: without the messages of machines of more."""
+    for identifier, above in _PHASES_ABOVE.findall(text):
+        if phases <= int(above):
+            text = re.sub(rf"^BO_ {identifier} .*\n(?: SG_ .*\n)*\n?", "", text, flags=re.MULTILINE)
+            text = re.sub(rf'^(?:(?:CM_|BA_ "\w+") (?:BO_|SG_)|VAL_) {identifier} .*\n', "", text, flags=re.MULTILINE)
+    return text
+
+
 NODE_STEP = 16
 """From the identifiers and data IDs of a drive to those of the next node number (firmware/comms/node.h)."""
 RIG_NODE_STEP = 0x100

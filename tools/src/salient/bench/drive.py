@@ -19,6 +19,7 @@ from salient.bus import e2e
 from salient.bus.identity import OtherDatabase
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
 from salient.config import either
+from salient.dbc import PHASES
 from salient.errors import RunFailed, close_names
 from salient.machine.parameter_table import CHOICES, value_name
 
@@ -46,11 +47,13 @@ _SAVING, _SAVED = 1, 2
 ORIGINS = ("defaults", "memory", "unusable")
 _FAULT_ITEMS = ("fault", "state", "checks", "start", "time_us", "time_wraps", "speed_rpm", "bus_voltage_V",
                 "current_max_A", "torque_reference_Nm", "current_a", "current_b", "current_c", "current_d", "angle",
-                "self_test", "phases")
+                "self_test", "phases", "current_e", "current_f")
 """Parts of the operations memory and fault_log, as drive.dbc lists them."""
 LOGGED_FAULTS = 16
 TRACE_PERIODS = 64
 _TRACE_PARTS, _TRACE_PHASES = 8, 4
+_TRACE_MORE_PARTS = 3
+"""Parts for two phases more; two phases a part."""
 _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
 
 
@@ -422,12 +425,19 @@ class LoggedFault:
     current_max_A: float
     torque_reference_Nm: float
     currents_A: tuple[float, ...]
-    """Of phases a to d; 0 of one that the machine does not have."""
+    """Of phases a to f; 0 of one that the machine does not have."""
     rotor_angle_deg: float
     self_test: tuple[str, ...]
     """Checks of DRIVE_SELF_TEST that had failed."""
     phases: str
     """Letters of the phases of DRIVE_PHASE_FAULT."""
+
+
+def _self_tests() -> dict[int, str]:
+    """Names of the checks by their bits in the log: those of DRIVE_SELF_TEST, then the sensors of phases e and f."""
+    signals = drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
+    more = [f"{part}_sensor_{phase}" for part in ("winding", "inverter") for phase in PHASES[4:]]
+    return {signal.start: signal.name for signal in signals} | dict(enumerate(more, start=len(signals)))
 
 
 class FaultLog(Sequence[LoggedFault]):
@@ -453,7 +463,7 @@ class FaultLog(Sequence[LoggedFault]):
         items: dict[str, int] = {}
         for part, name in enumerate(_FAULT_ITEMS):
             status, items[name] = _access(self._session, "fault_log", 0, part, number)
-            if status != "done":
+            if status != "done" and name not in ("current_e", "current_f"):  # those a drive of four phases has not
                 return None
         snapshot = self._session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
         physical = {signal.name: items[signal.name] * float(signal.scale) for signal in snapshot.signals}
@@ -466,11 +476,10 @@ class FaultLog(Sequence[LoggedFault]):
             checks=tuple(name for value, name in names.items() if value > 0 and items["checks"] >> value & 1),
             state=states.get(items["state"], str(items["state"])),
             currents_A=tuple(items[f"current_{phase}"] * float(snapshot.get_signal_by_name("current_max_A").scale)
-                             for phase in "abcd"),
+                             for phase in PHASES),
             rotor_angle_deg=items["angle"] * 360.0 / 65536.0,
-            self_test=tuple(signal.name for signal in drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
-                            if items["self_test"] >> signal.start & 1),
-            phases="".join(phase for bit, phase in enumerate("abcd") if items["phases"] >> bit & 1), **physical)
+            self_test=tuple(name for bit, name in _self_tests().items() if items["self_test"] >> bit & 1),
+            phases="".join(phase for bit, phase in enumerate(PHASES) if items["phases"] >> bit & 1), **physical)
 
 
 @dataclass(frozen=True)
@@ -493,9 +502,11 @@ class FaultTrace:
 def read_fault_trace(session: Client) -> FaultTrace:
     """Reads the trace from the drive, which keeps it from a fault to the next run; takes some 0.3 s of virtual time.
     DriveError when there is none."""
-    raw = np.zeros((TRACE_PERIODS, 2 * _TRACE_PARTS), dtype="<i2")
+    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
+    parts = _TRACE_PARTS + (_TRACE_MORE_PARTS if phases > _TRACE_PHASES else 0)
+    raw = np.zeros((TRACE_PERIODS, 2 * parts), dtype="<i2")
     for period in range(TRACE_PERIODS):
-        for part in range(_TRACE_PARTS):
+        for part in range(parts):
             status, value = _access(session, "fault_trace", period, part)
             if status != "done":
                 reason = ": the drive keeps no record; it has had no fault, or has run since"
@@ -504,8 +515,8 @@ def read_fault_trace(session: Client) -> FaultTrace:
     snapshot = session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
     scale = {signal.name: float(signal.scale) for signal in snapshot.signals}
     positive = raw.astype(np.uint16).astype(float)
-    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
-    columns = [slice(first, first + phases) for first in (0, 8, 8 + _TRACE_PHASES)]
+    columns = [[*range(first, first + _TRACE_PHASES), more, more + 1][:phases]
+               for first, more in ((0, 16), (8, 18), (8 + _TRACE_PHASES, 20))]
     return FaultTrace(
         time_s=np.arange(1 - TRACE_PERIODS, 1) / session.telemetry["DRIVE_HEARTBEAT.control_rate_hz"].last,
         current_A=positive[:, columns[0]] * scale["current_max_A"],

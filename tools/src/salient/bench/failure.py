@@ -16,12 +16,13 @@ from salient.bench.session import Session
 from salient.bench.stimulus import STIMULI, Stimulus, last_before, stimuli_of
 from salient.bus.log import write_logs
 from salient.config import BenchConfig
+from salient.dbc import PHASES
 from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
 """Of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
-COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9")
+COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00")
 """Those of the live page (view/page/palette.js)."""
 TRUTH = "truth.npy"
 LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
@@ -160,7 +161,7 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path,
         [("telemetry", "DRIVE_MOTION.speed_reference_rpm"), ("telemetry", "speed_rpm"), ("truth", "speed_rpm")],
         [("telemetry", "torque_reference_Nm"), ("telemetry", "torque_estimate_Nm"), ("truth", "torque_Nm"),
          ("truth", "load_torque_Nm")],
-        [("truth", f"current_{phase}_A") for phase in "abcd"],
+        [("truth", f"current_{phase}_A") for phase in PHASES],
     )  # fmt: skip
     from_s, to_s = max(0.0, time_s - before_s), time_s + AFTER_S
     labelled = _labelled(acts, from_s, to_s)
@@ -172,8 +173,8 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path,
     for axes, panel in zip(rows, panels, strict=True):
         for (source, name), colour in zip(panel, COLOURS, strict=False):
             signal = getattr(session, source)[name]
-            if name == "current_d_A" and not signal.value.any():
-                continue  # a machine of three phases
+            if name in ("current_d_A", "current_e_A", "current_f_A") and not signal.value.any():
+                continue  # a machine of fewer phases
             signal = signal.between(from_s, to_s)
             axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,
                       marker="." if before_s <= BEFORE_S else "", markersize=3)

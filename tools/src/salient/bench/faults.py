@@ -24,11 +24,11 @@ from cantools.database.can import Signal
 
 from salient.bus.signals import rig_database, signal_range
 from salient.config import either
+from salient.dbc import PHASES
 from salient.errors import UsageError, close_names
 from salient.paths import ROOT
 
 PAGE = ROOT / "emulator" / "FAULTS.md"
-PHASES = ("a", "b", "c", "d")
 LEGS = ("high", "low")
 _MESSAGE = "RIG_FAULT"
 
@@ -161,7 +161,7 @@ def page() -> str:
     """Text of emulator/FAULTS.md."""
     rows = []
     for kind in fault_kinds().values():
-        has = (("phase a to d", kind.has_phase), ("leg high, low", kind.has_leg))
+        has = (("phase a to f", kind.has_phase), ("leg high, low", kind.has_leg))
         places = ", ".join(text for text, present in has if present)
         attribute = f"`{kind.attribute[0]}`" if kind.attribute else ""
         allowed = kind.allowed if kind.attribute else ""

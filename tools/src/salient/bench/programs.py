@@ -10,7 +10,7 @@ import fcntl
 import hashlib
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -28,6 +28,10 @@ _BUILDERS = {"host": "any tools/salient command",
              **{build: f"any tools/salient command with --target {build}" for build in TARGETS[1:]}}
 _IMAGE_PARTS = ("drive_codec", "salient_firmware", "salient_port", "salient_main")
 """Targets of CMake that images of every machine have in common."""
+
+
+_PHASES_OF_A_BUILD, _PHASES_MAX = 4, 6
+"""Phases that the images of a target build have room for, and at most (SALIENT_PHASES_MAX of CMakeLists.txt)."""
 
 
 class EmulatorError(RunFailed):
@@ -58,7 +62,9 @@ def image(machine: str, build: str) -> Path:
     path = machine_path(machine)
     if path.parent == MACHINES:
         return _built(build, f"salient_{path.stem}.elf", _builder(build))
-    return _build_custom(path, content_key(path), build)
+    from salient.machine.file import load_machine  # NumPy and pydantic, and here only
+
+    return _build_custom(path, content_key(path), build, load_machine(path).phases)
 
 
 def deferred_instructions(instructions: Path) -> Path:
@@ -104,21 +110,25 @@ def _built(build: str, name: str, builder: str) -> Path:
 
 
 @lru_cache
-def _build_custom(path: Path, key: str, build: str) -> Path:
+def _build_custom(path: Path, key: str, build: str, phases: int) -> Path:
     """Builds the image for a user's machine file in a folder for its path and content, one process at a time. Of the
-    sources only its tables are compiled: it links the firmware of the target build."""
+    sources only its tables are compiled: it links the firmware of the target build, of a machine of more than four
+    phases that of a build with room for six."""
     if shutil.which("cmake") is None:
         raise UsageError("cmake is missing; a machine file of your own on a target requires a build")
     _remove_orphans()
     folder = BUILD / f"machine-{hashlib.sha256(f'{path} {key}'.encode()).hexdigest()[:12]}"
     folder.mkdir(exist_ok=True)
+    parts, options = BUILD / build, tuple[str, ...]()
+    if phases > _PHASES_OF_A_BUILD:
+        parts, options = BUILD / f"phases-{_PHASES_MAX}" / build, (f"-DSALIENT_PHASES_MAX={_PHASES_MAX}",)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (folder / "machine_file").write_text(str(path), encoding="utf-8")
         commands = []
         if not (folder / build / "build.ninja").exists():
             commands.append(["cmake", "--preset", build, "-B", str(folder / build), f"-DSALIENT_MACHINE_FILE={path}",
-                             f"-DSALIENT_BUILT={BUILD / build}", f"-DSALIENT_PYTHON={sys.executable}"])
+                             f"-DSALIENT_BUILT={parts}", f"-DSALIENT_PYTHON={sys.executable}", *options])
         commands.append(["cmake", "--build", str(folder / build), "--target", "custom_image"])
         log = folder / "build.log"
 
@@ -126,15 +136,17 @@ def _build_custom(path: Path, key: str, build: str) -> Path:
         def notice() -> None:
             print(f"salient: building the firmware for {path}", file=sys.stderr, flush=True)
 
-        if not (_build_parts(build, log, notice) and run_commands(commands, ROOT, log, notice)):
+        if not (_build_parts(parts, options, log, notice) and run_commands(commands, ROOT, log, notice)):
             raise EmulatorError(f"building the firmware for {path} failed: see {from_root(log)}")
     return folder / build / "bin" / "salient_custom.elf"
 
 
-def _build_parts(build: str, log: Path, notice: Callable[[], None]) -> bool:
+def _build_parts(folder: Path, options: Sequence[str], log: Path, notice: Callable[[], None]) -> bool:
     """Brings what the images of a target build link up to date; no two commands build at once."""
     with build_lock():
-        return build_preset(ROOT, BUILD / build, _IMAGE_PARTS, log, notice)
+        folder.parent.mkdir(exist_ok=True)
+        python = (f"-DSALIENT_PYTHON={sys.executable}",) if options else ()
+        return build_preset(ROOT, folder, _IMAGE_PARTS, log, notice, (*options, *python))
 
 
 def _remove_orphans() -> None:

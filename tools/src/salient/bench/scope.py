@@ -22,6 +22,7 @@ from salient.bus.frame_bits import BitRates
 from salient.bus.log import open_log
 from salient.bus.traffic import MISSING_CYCLES, Traffic
 from salient.bus.traffic_text import report_lines
+from salient.dbc import PHASES
 from salient.paths import make_folder
 
 TABLE, PLOT, SIGNALS = "scope.csv", "scope.png", "signals.csv"
@@ -80,7 +81,7 @@ def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
             found[name] = values
             continue
         quantity, _, unit = name.partition("_")
-        for phase, of_phase in zip("abcd", values.T, strict=False):
+        for phase, of_phase in zip(PHASES, values.T, strict=False):
             found[f"{quantity}_{phase}_A" if unit == "A" else f"{name}_{phase}"] = of_phase
     return found
 
@@ -106,11 +107,11 @@ def plot(trace: FaultTrace, path: Path, title: str) -> None:
         4 + phases, 1, sharex=True, height_ratios=[2.5, 1.5, 1.5, 1.5, *[1] * phases])
     time_ms = trace.time_s * _MS_PER_S
     for phase, duties in enumerate(of_phases):
-        currents.plot(time_ms, trace.current_A[:, phase], color=COLOURS[phase], label=f"phase {'abcd'[phase]}")
+        currents.plot(time_ms, trace.current_A[:, phase], color=COLOURS[phase], label=f"phase {PHASES[phase]}")
         duties.step(time_ms, _PERCENT * trace.upper_duty[:, phase], where="post", color=COLOURS[phase], label="upper")
         duties.step(time_ms, _PERCENT * trace.lower_duty[:, phase], where="post", color=COLOURS[phase],
                     linestyle="dotted", label="lower")
-        _label(duties, f"duty {'abcd'[phase]}, %")
+        _label(duties, f"duty {PHASES[phase]}, %")
         duties.set_ylim(-5, 105)
         duties.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
     _label(currents, "current, A")

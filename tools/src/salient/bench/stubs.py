@@ -10,9 +10,10 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from salient.bench.faults import LEGS, PHASES, FaultKind, fault_kinds
+from salient.bench.faults import LEGS, FaultKind, fault_kinds
 from salient.bench.rig import bench_variables, variable_range
 from salient.bus.signals import SignalTable, drive_database, rig_database
+from salient.dbc import PHASES
 from salient.machine.parameter_table import read_table
 from salient.paths import LOADS
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from salient.bench.bench import Bench
 from salient.config import BenchConfig
+from salient.dbc import PHASES, PHASES_MAX
 from salient.errors import UsageError
 from salient.machine.file import load_machine, machine_path
 from salient.paths import BUILD, from_root
@@ -22,9 +23,8 @@ from salient.paths import BUILD, from_root
 TICK_NS = 5
 """PWM_TIMER_TICK_NS of emulator/plant/pwm_timer.h."""
 
-_PHASES_MAX = 4
 _SETTLE_S = 0.2
-_STATE = np.dtype([("angle_rad", "f8"), ("speed_rad_s", "f8"), ("torque_Nm", "f8"), ("current_A", "f8", _PHASES_MAX)])
+_STATE = np.dtype([("angle_rad", "f8"), ("speed_rad_s", "f8"), ("torque_Nm", "f8"), ("current_A", "f8", PHASES_MAX)])
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def record(folder: Path, duration_s: float = 0.1, controller: str = "paper",
         bench.load_torque_Nm = load_torque_Nm
         bench.run_for(_SETTLE_S + duration_s)
     start = np.load(recording)[0]
-    compares = np.fromfile(switches, dtype="u2").reshape(-1, 2, _PHASES_MAX)
+    compares = np.fromfile(switches, dtype="u2").reshape(-1, 2, PHASES_MAX)
     phases = load_machine(machine_path(machine)).phases
     # The first row takes effect at the end of the first period.
     first = round(start["time_s"] * 1e9 / period_ns) - 1
@@ -142,7 +142,7 @@ def record(folder: Path, duration_s: float = 0.1, controller: str = "paper",
         angle_rad=float(np.radians(start["rotor_angle_deg"], dtype=float)),
         speed_rad_s=float(start["speed_rpm"]) * np.pi / 30.0,
         load_torque_Nm=load_torque_Nm,
-        current_A=tuple(float(start[f"current_{'abcd'[phase]}_A"]) for phase in range(phases)),
+        current_A=tuple(float(start[f"current_{PHASES[phase]}_A"]) for phase in range(phases)),
     )
 
 
@@ -156,10 +156,10 @@ def program(machine: str) -> Path:
 
 def program_input(pattern: SwitchingPattern, passes: int, step_factor: float = 1.0) -> bytes:
     """Input of plant_benchmark_<machine> (emulator/plant_benchmark/main.c)."""
-    current_A = [*pattern.current_A, *[0.0] * (_PHASES_MAX - pattern.phases)]
+    current_A = [*pattern.current_A, *[0.0] * (PHASES_MAX - pattern.phases)]
     state = (pattern.angle_rad, pattern.speed_rad_s, pattern.load_torque_Nm, *current_A, step_factor)
     head = struct.pack("8d4I", *state, pattern.period_ticks, pattern.periods, passes, 0)
-    compares = np.zeros((pattern.periods, 2, _PHASES_MAX), dtype="u2")
+    compares = np.zeros((pattern.periods, 2, PHASES_MAX), dtype="u2")
     compares[:, 0, : pattern.phases], compares[:, 1, : pattern.phases] = pattern.upper, pattern.lower
     return head + compares.tobytes()
 

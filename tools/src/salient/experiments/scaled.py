@@ -70,7 +70,7 @@ def scale_of(machine: Machine) -> Scale:
     return Scale(
         speed=data.speed_base_rpm / PAPER_BASE_RPM,
         torque=data.torque_rated_Nm / PAPER_RATED_NM,
-        speed_max_rpm=Scaling(data, choose(data, machine)).speed_range_rpm,
+        speed_max_rpm=Scaling(data, choose(data, machine), machine.phases).speed_range_rpm,
         torque_max_Nm=data.parameters["torque_max_Nm"],
         start_s_per_rpm=machine.inertia_kg_m2 * math.pi / 30.0 / data.parameters["torque_max_Nm"],
         electrical_Hz_per_rpm=machine.rotor_poles / 60.0,

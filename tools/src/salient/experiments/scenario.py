@@ -57,12 +57,13 @@ from pydantic import create_model
 from salient.bench.bench import Bench
 from salient.bench.drive import READY_TIMEOUT_S
 from salient.bench.emulator import parameter_table
-from salient.bench.faults import PHASES, FaultError, attribute_names, fault_signals
+from salient.bench.faults import FaultError, attribute_names, fault_signals
 from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.rig import CHANGES_MAX, bench_variables, variable_range
 from salient.bus.log import write_logs
 from salient.bus.signals import SignalTable, drive_database, signal_range
 from salient.config import CONDITIONS, CONTROLLERS, DEFAULTS, BenchConfig, Conditions, either
+from salient.dbc import PHASES
 from salient.errors import UsageError, close_names
 from salient.experiments.consistency import check_consistency
 from salient.experiments.metrics import losses

@@ -1,6 +1,6 @@
 """Writes the C codec of a CAN database: cantools' pack and unpack functions, and setters that saturate.
 
-    python -m salient.generate.codec [--integer] [--node NODE] FILE.dbc OUTDIR
+    python -m salient.generate.codec [--integer] [--phases N] [--node NODE] FILE.dbc OUTDIR
 
 writes OUTDIR/FILE_codec.h and OUTDIR/FILE_codec.c, every name in them with the prefix `FILE_` once: message FILE_STATUS
 is `struct file_status_t`. cantools' pack functions truncate a value to the bits of its signal; the setters added here
@@ -20,7 +20,7 @@ from cantools.database.can.database import Database
 from cantools.database.can.signal import Signal
 from cantools.database.errors import UnsupportedDatabaseFormatError
 
-from salient.dbc import attributes, database_hash
+from salient.dbc import PHASES_MAX, attributes, database_hash, drive_dbc_of_phases
 from salient.generate.enumerations import enumerations_header
 from salient.generate.error import CodecError
 from salient.generate.files import write_files
@@ -87,12 +87,12 @@ def setters(database: Database, prefix: str, integer: bool) -> tuple[str, str]:
     return "\n".join(declarations), "\n".join([*(_SATURATE[name] for name in sorted(used)), *definitions])
 
 
-def generate_codec(dbc: Path, integer: bool, node: str | None = None) -> dict[str, str]:
+def generate_codec(dbc: Path, integer: bool, node: str | None = None, phases: int = PHASES_MAX) -> dict[str, str]:
     """File name -> C text of the codec of `dbc`; `integer` leaves every floating-point conversion out. `node`: with
-    the enumerations and what this node sends cyclically."""
+    the enumerations and what this node sends cyclically. `phases`: without messages of machines of more phases."""
     try:
         # cantools passes over an incomplete last statement; one more statement after it makes that an error.
-        text = dbc.read_text(encoding="cp1252") + "\nVAL_TABLE_ end_of_file ;\n"
+        text = drive_dbc_of_phases(dbc.read_text(encoding="cp1252"), phases) + "\nVAL_TABLE_ end_of_file ;\n"
         database = cantools.database.load_string(text, database_format="dbc")
     except OSError as error:
         raise CodecError(f"{dbc}: {error.strerror}") from error
@@ -162,11 +162,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="salient.generate.codec", description="C codec of a CAN database (DBC)")
     parser.add_argument("--integer", action="store_true", help="no floating-point conversions")
     parser.add_argument("--node", help="also enumerations, and the cyclic messages of this node")
+    parser.add_argument("--phases", type=int, default=PHASES_MAX, help="without messages of machines of more phases")
     parser.add_argument("dbc", type=Path, metavar="DBC")
     parser.add_argument("folder", type=Path, metavar="OUTDIR")
     options = parser.parse_args(arguments)
     return write_files("salient.generate.codec", options.folder,
-                       lambda: generate_codec(options.dbc, options.integer, options.node), CodecError)
+                       lambda: generate_codec(options.dbc, options.integer, options.node, options.phases),
+                       CodecError)
 
 
 if __name__ == "__main__":

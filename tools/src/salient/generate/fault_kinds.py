@@ -20,7 +20,7 @@ from salient.generate.files import write_files
 from salient.generate.ranges import raw_range
 
 _MESSAGE = "RIG_FAULT"
-_BEGINS, _PHASE, _LEG, _ATTRIBUTE = (11, 1, False), (8, 2, False), (10, 1, False), (12, 20, True)
+_BEGINS, _PHASE, _LEG, _ATTRIBUTE = (11, 1, False), (7, 3, False), (10, 1, False), (12, 20, True)
 _HEADER = """\
 /* Kinds of faults: multiplexed signals of {message} in {source}, from which this file was generated. */
 #ifndef FAULT_KINDS_H
@@ -57,8 +57,8 @@ typedef struct {{
 static inline fault_request_t fault_request(const uint8_t *data) {{
     const int32_t bits = data[1] >> 4 | data[2] << 4 | data[3] << 12;
     return (fault_request_t){{
-        .kind = data[0],
-        .phase = data[1] & 3u,
+        .kind = data[0] & 0x7Fu,
+        .phase = (uint8_t)(data[0] >> 7 | (data[1] & 3u) << 1),
         .leg = data[1] >> 2 & 1u,
         .begins = data[1] >> 3 & 1u,
         .raw = (bits ^ 0x80000) - 0x80000,

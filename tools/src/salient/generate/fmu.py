@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from salient.dbc import PHASES
 from salient.generate.files import write_files
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.scaling import scaling_of
@@ -70,7 +71,7 @@ class Variable:
 def variables(machine: Machine) -> list[Variable]:
     """Inputs, outputs and parameters of a unit of this machine. Limits are those of the plant, wider than a machine
     file's: the firmware's number formats do not matter here."""
-    phases = [(phase, "abcd"[phase]) for phase in range(machine.phases)]
+    phases = [(phase, PHASES[phase]) for phase in range(machine.phases)]
     return [
         Variable("time", "time_s", "independent", "time", "s"),
         *(

@@ -2,7 +2,8 @@
 
 The schedule is that of the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
 marks messages that are sent only while their cause lasts; the enumeration TelemetryGroup names the messages that are
-queued together; TelemetryRate those whose period can be set, GenMsgCycleTime being its default.
+queued together; PhasesAbove those that only a machine of more phases sends; TelemetryRate those whose period can be
+set, GenMsgCycleTime being its default.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from cantools.database.can.database import Database
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
-from salient.dbc import attributes
+from salient.dbc import attributes, phases_above
 from salient.generate.error import CodecError
 from salient.generate.ranges import raw_range
 
@@ -126,6 +127,7 @@ typedef struct {{
     uint8_t group;   /* {prefix}_telemetry_group_t */
     uint8_t rate;    /* {prefix}_telemetry_rate_t */
     bool if_active;  /* sent only while its cause lasts (cyclicIfActive) */
+    uint8_t phases_above; /* only a machine of more phases sends it (PhasesAbove) */
     uint16_t period; /* {upper}_TELEMETRY_CYCLE_MS; of a rate that can be set the default */
     uint16_t delay;  /* of the first frame after start, {upper}_TELEMETRY_CYCLE_MS */
 }} {prefix}_telemetry_message_t;
@@ -167,7 +169,7 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
         active = str(message.send_type == "cyclicIfActive").lower()
         rows.append(
             f"    {{{message.frame_id:#x}u, {message.length}u, {group}u, {_rate_number(message)}u, {active}, "
-            f"{period}u, {delay}u}},"
+            f"{phases_above(message)}u, {period}u, {delay}u}},"
         )
     new_line = "\n"
     return f"""/* Cyclic messages of {dbc_name}; generated. */

@@ -6,12 +6,14 @@ The meaning of the keys: emulator/plant/machine.h.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
+from salient.dbc import PHASES_MAX
 from salient.errors import close_names, shown
 from salient.machine.contradictions import contradiction
 from salient.machine.definition import Machine, MachineError
@@ -28,8 +30,11 @@ __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "Machin
 
 FORMS = (*FORMULA_KEYS, "map")
 
-# Phases by stator and rotor poles.
-_PHASES = {(6, 4): 3, (8, 6): 4, (12, 8): 3}
+PHASES_MIN = 3
+"""With fewer there is an angle at which no phase has a torque in the wanted direction."""
+ROTOR_POLES = range(2, 41)
+"""A misalignment of 4 mechanical degrees, which the drive learns, is less than half a revolution of its angles."""
+STATOR_POLES = range(PHASES_MIN, PHASES_MAX * (ROTOR_POLES.stop - 1) + 1)
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
@@ -197,11 +202,26 @@ def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula 
 
 def poles_and_phases(poles: Poles) -> tuple[int, int, int]:
     """Stator poles, rotor poles and phases."""
-    pair = (poles.stator, poles.rotor)
-    if all(type(number) is int for number in pair) and pair in _PHASES:
-        return *pair, _PHASES[pair]
-    names = ", ".join(f"{stator}/{rotor}" for stator, rotor in _PHASES)
-    raise TextFileError(f"poles: {shown(poles.stator)}/{shown(poles.rotor)}: must be one of {names}")
+    stator, rotor = poles.stator, poles.rotor
+    keys = f"poles.stator, poles.rotor: {shown(stator)}/{shown(rotor)}"
+    if any(type(number) is not int or number not in poles
+           for number, poles in ((stator, STATOR_POLES), (rotor, ROTOR_POLES))):
+        raise TextFileError(f"{keys}: must be whole numbers, from {STATOR_POLES.start} to {STATOR_POLES.stop - 1} and"
+                            f" from {ROTOR_POLES.start} to {ROTOR_POLES.stop - 1}")
+    phases = phases_of(stator, rotor)
+    if phases < PHASES_MIN:
+        raise TextFileError(f"{keys}: {phases} phase{'s' * (phases > 1)}, {stator} / gcd({stator}, {rotor}), which"
+                            f" cannot start from every angle; must have {PHASES_MIN} to {PHASES_MAX}")
+    if phases > PHASES_MAX:
+        raise TextFileError(f"{keys}: {phases} phases, {stator} / gcd({stator}, {rotor}); must have {PHASES_MIN} to"
+                            f" {PHASES_MAX}")
+    return stator, rotor, phases
+
+
+def phases_of(stator: int, rotor: int) -> int:
+    """Phases of a machine: the stator poles at one angle of the rotor's pitch are those of a phase. The angles of all
+    poles divide the pitch evenly, so that phases are a stroke apart whichever of the two has more poles."""
+    return stator // math.gcd(stator, rotor)
 
 
 def _check_chopper(link: DcLink) -> None:

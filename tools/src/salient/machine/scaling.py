@@ -30,6 +30,7 @@ from functools import lru_cache
 import cantools
 from cantools.database.can import Database
 
+from salient.dbc import drive_dbc_of_phases
 from salient.machine.drive_data import CURRENT_RANGE_A, SAMPLES_PER_TURN_MIN, DriveData, derive
 from salient.machine.facts import Facts
 from salient.machine.file import Machine, MachineError
@@ -99,6 +100,7 @@ class Scaling:
 
     data: DriveData
     exponents: Exponents
+    phases: int
 
     def raw_parameters(self) -> list[int]:
         """Raw default of every parameter, by index."""
@@ -148,7 +150,7 @@ class Scaling:
 
     def dbc(self) -> str:
         """Text of the drive's CAN database: firmware/comms/drive.dbc with the factors and ranges of this machine."""
-        return drive_dbc(self.exponents, self._bus_speed(self._limit_rpm))
+        return drive_dbc(self.exponents, self._bus_speed(self._limit_rpm), self.phases)
 
 
 def scaling_of(path: object, machine: Machine) -> Scaling:
@@ -159,7 +161,7 @@ def scaling_of(path: object, machine: Machine) -> Scaling:
         _check(data, exponents, machine)
     except _OutOfRange as error:
         raise MachineError(f"{path}: {error}") from None
-    return Scaling(data, exponents)
+    return Scaling(data, exponents, machine.phases)
 
 
 class _OutOfRange(ValueError):
@@ -208,11 +210,13 @@ _MESSAGE_LINE = re.compile(r"BO_ \d+ (\w+):")
 _SIGNAL_LINE = re.compile(r'( SG_ (\w+) [^(]*)\(([^,]+),([^)]+)\) \[([^|]+)\|([^]]+)\] ("([^"]*)".*)')
 
 
-def drive_dbc(exponents: Exponents, speed_range: int) -> str:
+def drive_dbc(exponents: Exponents, speed_range: int, phases: int) -> str:
     """Text of firmware/comms/drive.dbc for these units: factors and ranges times powers of two, and the range of the
-    commands in LSBs. With SI units and 3000 r/min it is that file."""
+    commands in LSBs, with the messages that a machine of so many phases has. With SI units, 3000 r/min and more than
+    four phases it is that file."""
     lines, message = [], ""
-    for line in DRIVE_DBC.read_text(encoding="ascii").splitlines(keepends=True):
+    text = drive_dbc_of_phases(DRIVE_DBC.read_text(encoding="ascii"), phases)
+    for line in text.splitlines(keepends=True):
         if found := _MESSAGE_LINE.match(line):
             message = found[1]
         found = _SIGNAL_LINE.match(line)

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
+from salient.dbc import PHASES
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import known, names
@@ -161,7 +162,7 @@ def run_replay(options: argparse.Namespace) -> int:
     for event in described["events"]:
         until = f" to {event['end_us']}" if event["end_us"] else ""
         print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
-              + (f", phase {'abcd'[event['phase']]}, leg {('low', 'high')[event['leg']]}"
+              + (f", phase {PHASES[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
     again = replay(seed, kept, healthy, folder, options.build, programs)
     whole = kept == ALL_EVENTS and failure.bug is None

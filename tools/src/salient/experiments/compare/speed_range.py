@@ -175,7 +175,7 @@ class _Subject:
         (row,) = (row for row in read_table() if row.name == "torque_max_Nm")
         exponents = choose(self.data, self.machine)
         self.torque_max_Nm = min(math.ldexp(row.maximum, -exponents.fraction_bits(row)), _REQUEST_MAX_NM)
-        self.speed_range_rpm = Scaling(self.data, exponents).speed_range_rpm
+        self.speed_range_rpm = Scaling(self.data, exponents, self.machine.phases).speed_range_rpm
 
     def speeds_rpm(self, of_base: Sequence[float]) -> list[float]:
         """Multiples of the base speed up to the largest speed, four digits."""

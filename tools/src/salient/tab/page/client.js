@@ -21,6 +21,7 @@ const LOGGED_FAULTS = 16;
 const TRACE_PERIODS = 64;
 const TRACE_PARTS = 8;
 const TRACE_PHASES = 4;
+const TRACE_MORE_PARTS = 3; // of two phases more, two phases a part
 const TEXT_PARTS_MAX = 64;
 const ARMING_RETRY_NS = 500e6;
 const ARMING_ATTEMPTS_MAX = 4;
@@ -305,10 +306,13 @@ export class Client {
     }
 
     faultTrace() {
+        const { phases, control_rate_hz: rate } = this.messages.decode("DRIVE_HEARTBEAT",
+                                                                       this.latest("DRIVE_HEARTBEAT").data);
+        const parts = TRACE_PARTS + (phases > TRACE_PHASES ? TRACE_MORE_PARTS : 0);
         const raw = [];
         for (let period = 0; period < TRACE_PERIODS; period++) {
             const row = [];
-            for (let part = 0; part < TRACE_PARTS; part++) {
+            for (let part = 0; part < parts; part++) {
                 const [status, value] = this.#access("fault_trace", period, part);
                 if (status !== "done") {
                     throw new Rejected(`fault trace: ${status}`);
@@ -317,20 +321,19 @@ export class Client {
             }
             raw.push(row);
         }
-        const { phases, control_rate_hz: rate } = this.messages.decode("DRIVE_HEARTBEAT",
-                                                                       this.latest("DRIVE_HEARTBEAT").data);
         const factor = (name) => this.messages.signal("DRIVE_FAULT_SNAPSHOT", name).factor;
-        const columns = (first, scale) => raw.map((row) => row.slice(first, first + phases)
-            .map((value) => (value & 0xffff) * scale));
+        const columns = (first, more, scale) => raw.map((row) =>
+            [...row.slice(first, first + TRACE_PHASES), row[more], row[more + 1]].slice(0, phases)
+                .map((value) => (value & 0xffff) * scale));
         return {
             time_s: raw.map((_, period) => (period + 1 - TRACE_PERIODS) / rate),
-            current_A: columns(0, factor("current_max_A")),
+            current_A: columns(0, 16, factor("current_max_A")),
             bus_voltage_V: raw.map((row) => (row[4] & 0xffff) * factor("bus_voltage_V")),
             rotor_angle_deg: raw.map((row) => (row[5] & 0xffff) * 360 / 65536),
             speed_rpm: raw.map((row) => row[6] * factor("speed_rpm")),
             torque_reference_Nm: raw.map((row) => row[7] * factor("torque_reference_Nm")),
-            upper_duty: columns(8, 1 / 32768),
-            lower_duty: columns(8 + TRACE_PHASES, 1 / 32768),
+            upper_duty: columns(8, 18, 1 / 32768),
+            lower_duty: columns(8 + TRACE_PHASES, 20, 1 / 32768),
         };
     }
 

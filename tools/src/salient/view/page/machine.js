@@ -4,8 +4,9 @@ import { PHASE_COLOURS, PHASE_NAMES, withOpacity } from "./palette.js";
 
 const SIGNALS = {
     angle: ["RIG_TRUTH_BENCH.rotor_angle_deg", "DRIVE_MOTION.rotor_angle_deg"],
-    currents: ["a", "b", "c", "d"].map((phase) => [`RIG_TRUTH_CURRENTS.current_${phase}_A`,
-                                                   `DRIVE_CURRENTS.current_${phase}_A`]),
+    currents: ["a", "b", "c", "d", "e", "f"].map((phase, number) => [
+        `RIG_TRUTH_CURRENTS.current_${phase}_A`,
+        `${number < 4 ? "DRIVE_CURRENTS" : "DRIVE_PHASES_E_F"}.current_${phase}_A`]),
 };
 const OFF_PART = 0.01; // of the peak current: the phase is off
 const VOLTAGE_PART = 0.25; // of the supply: both switches on or both off, for most of the time between two samples

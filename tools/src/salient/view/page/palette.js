@@ -2,8 +2,8 @@
 // white.
 
 export const COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00", "#cc79a7"];
-export const PHASE_COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9"];
-export const PHASE_NAMES = ["A", "B", "C", "D"];
+export const PHASE_NAMES = ["A", "B", "C", "D", "E", "F"];
+export const PHASE_COLOURS = COLOURS.slice(0, PHASE_NAMES.length);
 
 /** Colour and dash of the n-th signal of a plot: the dash tells those of the same colour apart. */
 export function lineStyle(index) {

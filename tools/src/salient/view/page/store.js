@@ -3,7 +3,7 @@
 import { decoderOf, presenceOf } from "./decoder.js";
 
 /** Messages whose values the drive has read at the time that its last DRIVE_STATUS states. */
-const STAMPED = new Set(["DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS"]);
+const STAMPED = new Set(["DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS", "DRIVE_PHASES_E_F"]);
 const STAMP_AGE_MAX_NS = 20e6;
 
 /** Times and values that grow at their end; with a limit the oldest go. */
