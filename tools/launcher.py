@@ -102,7 +102,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine")
+WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs")
 """Commands that need no drive."""
 
 

@@ -15,8 +15,8 @@ from salient.target import long_run
 from salient.target.baseline import (
     BOUND_KEYS,
     FLASH_MAX_BYTES,
+    PAGE,
     RAM_MAX_BYTES,
-    README,
     long_run_metrics,
     profile_table,
     ram_needed,
@@ -136,8 +136,8 @@ def test_runs_execute_nearly_every_instruction_of_the_control_laws():
     assert sum(of.executed for of in background) > 0
 
 
-def test_readme_tables_match_the_baseline():
-    text = README.read_text(encoding="utf-8")
+def test_tables_of_the_page_match_the_baseline():
+    text = PAGE.read_text(encoding="utf-8")
     for table in tables_of(read()):
         assert table in text
 

@@ -181,6 +181,12 @@ def _wheel(options: argparse.Namespace) -> int:
     return build(options.out, options.tag)
 
 
+def _docs(options: argparse.Namespace) -> int:
+    from salient import documents
+
+    return documents.run(options.out, generate=options.generate)
+
+
 def _pil(options: argparse.Namespace) -> int:
     from salient.target.pil import run
 
@@ -219,6 +225,7 @@ _COMMANDS = {
     "machine": _machine,
     "pil": _pil,
     "wheel": _wheel,
+    "docs": _docs,
 }
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
-CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay")
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay", "docs")
 """Commands that need the sources."""
 _SHOWN_OUT, _SHOWN_BUILD = (text.replace("%", "%%") for text in (str(OUT), from_root(BUILD)))
 """For argparse, which formats a text of help."""
@@ -245,6 +245,11 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     wheel.add_argument("--out", type=Path, default=OUT / "wheel", metavar="DIR",
                        help="folder (default %(default)s)")
     wheel.add_argument("--tag", metavar="vX.Y.Z", help="tag of a release: must be that of the version")
+
+    docs = command("docs", "the documents as a site, for a browser")
+    docs.add_argument("--out", type=Path, default=OUT / "docs", metavar="DIR", help="folder (default %(default)s)")
+    docs.add_argument("--generate", action="store_true",
+                      help="first write the reference pages that follow from the sources")
 
     scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
                     "plot")

@@ -42,6 +42,8 @@ LOADS = ROOT / "tools" / "loads"
 SCENARIOS = ROOT / "tools" / "scenarios"
 DRIVE_DBC = ROOT / "firmware" / "comms" / "drive.dbc"
 PARAMETERS = ROOT / "firmware" / "storage" / "parameters.def"
+REFERENCE = ROOT / "docs" / "reference"
+"""Pages that generators and measurements write."""
 TAB_PAGE = ROOT / "tools" / "src" / "salient" / "tab" / "page"
 RIG_DBC = ROOT / "emulator" / "rig" / "rig.dbc"
 

@@ -9,7 +9,7 @@ and at most one more, <kind>_<attribute>.
 
     python -m salient.bench.faults
 
-writes the page of the kinds, emulator/FAULTS.md.
+writes the page of the kinds, docs/reference/bench-faults.md.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from salient.bus.signals import rig_database, signal_range
 from salient.config import either
 from salient.dbc import PHASES
 from salient.errors import UsageError, close_names
-from salient.paths import ROOT
+from salient.paths import REFERENCE
 
-PAGE = ROOT / "emulator" / "FAULTS.md"
+PAGE = REFERENCE / "bench-faults.md"
 LEGS = ("high", "low")
 _MESSAGE = "RIG_FAULT"
 
@@ -141,16 +141,21 @@ def _check_attribute(kind: FaultKind, value: Any) -> None:
 # --- The page ---
 
 _INTRODUCTION = """\
-# Faults that can be asked for
+# Faults of the test bench
 
-<!-- Written by python -m salient.bench.faults from rig/rig.dbc. -->
+Generated from `emulator/rig/rig.dbc` by `python -m salient.bench.faults`; do not edit.
 
-`bench.fault(KIND, phase=..., leg=..., ATTRIBUTE=..., duration_s=...)`, `bench.at(TIME).fault(...)`, in a scenario a
-table `[[fault]]` with the same names and `at_s`; over CAN `RIG_FAULT`. Begin and end are exact to the microsecond of
-virtual time and stand in the CAN log as `RIG_TRUTH_FAULT`; up to 64 changes wait for their time. Faults of different
-kinds and places act together. An unknown kind is an error that names the nearest three, an unknown place or attribute
-one that lists those of the kind, and what the machine or the target cannot do is refused as `unsupported`. Physics:
-`plant/faulted.h`; sensors: `plant/sensors.h`.
+| from | how |
+| --- | --- |
+| a test | `bench.fault(KIND, phase=..., leg=..., ATTRIBUTE=..., duration_s=...)`, `bench.at(TIME).fault(...)` |
+| a scenario | a table `[[fault]]` with the same names and `at_s` |
+| CAN | `RIG_FAULT` |
+
+- Begin and end are exact to the microsecond of virtual time. The CAN log has them as `RIG_TRUTH_FAULT`.
+- Up to 64 changes wait for their time. Faults of different kinds and places act together.
+- An unknown kind is an error that names the nearest three. An unknown place or attribute lists the valid ones.
+- A fault that the machine or the target cannot have is refused as `unsupported`.
+- Physics: `emulator/plant/faulted.h`; sensors: `emulator/plant/sensors.h`.
 
 | kind | places | attribute | range | meaning |
 | --- | --- | --- | --- | --- |
@@ -158,7 +163,7 @@ one that lists those of the kind, and what the machine or the target cannot do i
 
 
 def page() -> str:
-    """Text of emulator/FAULTS.md."""
+    """Text of the page."""
     rows = []
     for kind in fault_kinds().values():
         has = (("phase a to f", kind.has_phase), ("leg high, low", kind.has_leg))

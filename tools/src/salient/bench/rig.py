@@ -145,7 +145,7 @@ class Rig:
             self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
 
     def fault(self, kind: str, *, duration_s: float | None = None, **arguments: Any) -> Fault:
-        """Begins a fault: its places (phase, leg) and its attribute by name, emulator/FAULTS.md. With duration_s it
+        """Begins a fault: its places (phase, leg) and its attribute by name, bench-faults.md. With duration_s it
         ends by itself. FaultError."""
         signals = fault_signals(kind, arguments, True, self._at_us)
         start_us = self._at_us or -(-self._client.time_ns // 1000)

@@ -2,7 +2,7 @@
 
     python -m salient.experiments.fault_table [--jobs N]
 
-runs every cell and writes the page firmware/FAULTS.md, with the longest times of campaign.branching. In each run the
+runs every cell and writes docs/reference/drive-faults.md, with the longest times of campaign.branching. In each run the
 drive starts, carries a load, and has the fault then, or had it before the start.
 """
 
@@ -24,10 +24,10 @@ from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import FaultStep, LoadStep, Record, Scenario, SpeedStep, run_scenario
 from salient.machine.drive_data import derive
 from salient.machine.file import load_machine, machine_path
-from salient.paths import ROOT
+from salient.paths import REFERENCE, ROOT
 from salient.workers import process_pool
 
-PAGE = ROOT / "firmware" / "FAULTS.md"
+PAGE = REFERENCE / "drive-faults.md"
 BRANCHES = ROOT / "tests" / "campaign" / "branching"
 MACHINES = ("saturating", "linear_cosine", "linear_trapezoid", "finite_element")
 SPEED_RPM, LOAD_NM = 600.0, 12.0
@@ -193,19 +193,26 @@ def _measure(cell: tuple[FaultCase, str, str]) -> str:
 # --- The page ---
 
 _INTRODUCTION = f"""\
-# What the drive does about faults
+# Reaction of the drive to faults
 
-<!-- Written by python -m salient.experiments.fault_table. -->
+Measured and written by `python -m salient.experiments.fault_table`; do not edit.
 
-What can be asked for is in [emulator/FAULTS.md](../emulator/FAULTS.md), what each fault of the drive means in
-[README.md](README.md) and `comms/drive.dbc`. Each cell is one run at 40 kHz with the default parameters, a 12-bit
-converter and an encoder of 17 bits: the fault begins at {SPEED_RPM:g} r/min under {LOAD_NM:g} N m, or before a start to
-that speed, in phase b where it has a phase. A cell has the drive's first cause, the time to it from the start of the
-fault or of the run, for an encoder before the start the rotation until then, and the largest true phase current after
-the begin, of the trip. After the first cause all switches are open; a current above 1.1 of the trip is then driven by
-the rotor through the diodes, which no switch can end. A reset by the watchdog is reported once the background runs.
+[Faults of the test bench](bench-faults.md) explains the first column, [safety](../safety/protections.md) and
+[phases and encoder](../safety/phases-and-encoder.md) the drive's causes.
 
-Causes that a drive cannot tell apart have one name: a phase without current has an open winding, an open switch, no
+Each cell is one run at 40 kHz with default parameters, a 12-bit converter and a 17-bit encoder. The fault begins at
+{SPEED_RPM:g} r/min under {LOAD_NM:g} N m, or before a start to that speed, in phase b where it has a phase.
+A cell has, in order:
+
+1. the drive's first cause;
+2. the time to it from the start of the fault or of the run;
+3. the rotation until then, for an encoder that failed before the start;
+4. the largest true phase current after the start of the fault, as a multiple of the trip.
+
+After the first cause all switches are open. A current above 1.1 of the trip is then driven by the rotor through the
+diodes, and no switch can end it. A reset by the watchdog is reported once the background runs.
+
+Causes that a drive cannot tell apart have one name. A phase without current has an open winding, an open switch, no
 gate supply or a dead sensor. A shaft that is locked within a period looks like a frozen encoder.
 """
 
@@ -218,9 +225,9 @@ def page(cells_of: dict[tuple[str, str, str], str]) -> str:
                      f"|{' --- |' * (1 + len(CONTROLLERS))}\n")
         parts += [f"| {case.name} | {' | '.join(cells_of[case.name, machine, name] for name in CONTROLLERS)} |\n"
                   for case in CASES]
-    parts.append("\n## Why a drive may run on\n\n| fault | reason |\n| --- | --- |\n")
+    parts.append("\n## Reasons why a drive runs on\n\n| fault | reason |\n| --- | --- |\n")
     parts += [f"| {case.name} | {case.unseen} |\n" for case in CASES if case.unseen]
-    parts.append("\n## What the host cannot have\n\n| fault | reason |\n| --- | --- |\n")
+    parts.append("\n## Faults that the host cannot have\n\n| fault | reason |\n| --- | --- |\n")
     parts += [f"| {case.name} | {case.unsupported} |\n" for case in CASES if case.unsupported]
     return with_branches("".join(parts))
 

@@ -27,7 +27,7 @@
     torque_Nm = 8.0
     profile_Nm = 2.0                        # optional: with a load_profile, the torque of its value 1
 
-    [[fault]]                               # of the test bench, with its places and attribute: emulator/FAULTS.md
+    [[fault]]                               # of the test bench, with its places and attribute: bench-faults.md
     kind = "switch_open"
     phase = "b"
     leg = "low"

@@ -2,7 +2,7 @@
 
     python -m salient.generate.checkers
 
-writes emulator/campaign/CHECKERS.md. A checker's text is the first comment of its file.
+writes docs/reference/checkers.md. A checker's text is the first comment of its file.
 """
 
 from __future__ import annotations
@@ -10,20 +10,21 @@ from __future__ import annotations
 import re
 import sys
 
-from salient.paths import ROOT
+from salient.paths import REFERENCE, ROOT
 
 CAMPAIGN = ROOT / "emulator" / "campaign"
-PAGE = CAMPAIGN / "CHECKERS.md"
+PAGE = REFERENCE / "checkers.md"
 
 _HEAD = """# The campaign's checkers
 
-Generated from `checkers/` by `python -m salient.generate.checkers`; do not edit.
+Generated from `emulator/campaign/checkers/` by `python -m salient.generate.checkers`; do not edit.
 
-Each judges one property of every world, from true values of the plant, the faults that are there, what the clients
-meant, and of the drive its state, its first cause and its measurements (`observation.h`). What each fault disturbs and
-which causes it may have is in `fault_effects.c`. A disturbance excuses while it is there and for 200 ms after its end.
-A rule has no exception for a weakness of the drive: deviations that are known are in `tests/campaign/known.toml`, by
-seed.
+Each judges one property of every world of a [campaign](../testing/campaigns.md). Inputs are the plant's true values,
+the present faults, the clients' intent, and the drive's state, first cause and measurements (`observation.h`).
+
+- `fault_effects.c` has the quantities that each fault disturbs, and the causes that it may have.
+- A disturbance excuses while it is present and for 200 ms after its end.
+- A rule has no exception for a weakness of the drive. Known deviations are in `tests/campaign/known.toml`, by seed.
 """
 
 _GROUPS = {

@@ -2,7 +2,7 @@
 
     python -m salient.generate.parameters
 
-writes firmware/PARAMETERS.md.
+writes docs/reference/parameters.md.
 """
 
 from __future__ import annotations
@@ -10,19 +10,21 @@ from __future__ import annotations
 import sys
 
 from salient.machine.parameter_table import read_table
-from salient.paths import ROOT
+from salient.paths import REFERENCE
 
-PAGE = ROOT / "firmware" / "PARAMETERS.md"
+PAGE = REFERENCE / "parameters.md"
 
 _HEAD = """# Parameters of the drive
 
-Generated from `storage/parameters.def` by `python -m salient.generate.parameters`; do not edit.
+Generated from `firmware/storage/parameters.def` by `python -m salient.generate.parameters`; do not edit.
 
-The index addresses a parameter over CAN (`comms/drive.dbc`); the raw value has an LSB of 2^-(fraction bits) of the
-unit. Parameters are read with PARAMETER_REQUEST, and changed as a set that is applied as a whole
-([comms/README.md](comms/README.md#a-set-of-parameters)). *In run*: may be changed in state run, without a step of the
-law's state; the others outside of it only. Angles are electrical degrees of the phase: 180 is the unaligned, 360 the
-aligned position. (traditional, paper, salient): used by these controllers only.
+- *Index*: addresses the parameter over CAN.
+- *Fraction bits*: the raw value has an LSB of 2^-(fraction bits) of the unit.
+- *In run*: may be changed in state run, without a step of the law's state. The others change outside of it only.
+- Angles are electrical degrees of the phase: 180 is the unaligned, 360 the aligned position.
+- (traditional, paper, salient): used by these controllers only.
+
+Read one with `PARAMETER_REQUEST`; change several as [one set](../can/parameters.md#a-set-of-parameters).
 
 | index | name | unit | minimum | maximum | default | fraction bits | in run | meaning |
 | ---: | --- | --- | ---: | ---: | ---: | ---: | --- | --- |

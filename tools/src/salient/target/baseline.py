@@ -1,5 +1,5 @@
 """Baseline of the targets: flash, RAM and stack of each build, and instructions of the control interrupt.
-`salient pil --figures` measures it and writes FILE and the tables of README; tests/target compares the builds with
+`salient pil --figures` measures it and writes FILE and the tables of PAGE; tests/target compares the builds with
 it."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from salient.bench.programs import image
 from salient.config import CONTROLLERS, TARGET_BUILDS
 from salient.elf import ElfImage
 from salient.errors import UsageError
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, REFERENCE, ROOT
 from salient.target import long_run
 from salient.target.bound_report import bounds
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, RATES_HZ, fits
@@ -22,7 +22,7 @@ from salient.target.static_checks import deepest_stack, size
 
 FILE = ROOT / "tests" / "target" / "baseline.toml"
 MACHINE = "saturating"
-README = ROOT / "firmware" / "README.md"
+PAGE = REFERENCE / "cost.md"
 FLASH_MAX_BYTES = 80 * 1024
 """Limit of the firmware with the tables of one machine; cmake/check_size.cmake enforces it."""
 RAM_MAX_BYTES = 20 * 1024
@@ -98,7 +98,7 @@ def read() -> Baseline:
 
 
 def measure_and_write() -> int:
-    """Builds and measures all targets, writes FILE and the tables of README, prints the tables; returns 0. UsageError
+    """Builds and measures all targets, writes FILE and the tables of PAGE, prints the tables; returns 0. UsageError
     when a build fails."""
     from salient.test_runner import build_preset
 
@@ -108,12 +108,12 @@ def measure_and_write() -> int:
     baseline, profiles, worst = measure_all()
     write(baseline)
     tables = [*tables_of(baseline), module_table(profiles, worst)]
-    text = README.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     for table in tables:
         text = with_table(text, table)
-    README.write_text(text, encoding="utf-8")
+    PAGE.write_text(text, encoding="utf-8")
     print("\n\n".join(tables))
-    print(f"\nwritten to {FILE.relative_to(ROOT)} and {README.relative_to(ROOT)}")
+    print(f"\nwritten to {FILE.relative_to(ROOT)} and {PAGE.relative_to(ROOT)}")
     return 0
 
 
@@ -131,14 +131,14 @@ def with_table(text: str, table: str) -> str:
     head = table.partition("\n")[0]
     before, found, rest = text.partition(f"{head}\n")
     if not found:
-        raise UsageError(f"{README.name}: no table with the column titles {head}")
+        raise UsageError(f"{PAGE.name}: no table with the column titles {head}")
     lines = rest.splitlines(keepends=True)
     length = next((i for i, line in enumerate(lines) if not line.startswith("|")), len(lines))
     return before + table + "\n" + "".join(lines[length:])
 
 
 def tables_of(baseline: Baseline) -> list[str]:
-    """The tables of README that follow from the baseline."""
+    """The tables of PAGE that follow from the baseline."""
     return [size_table(baseline["size"]), profile_table(baseline["interrupt"], baseline["deferred"]),
             rate_table(baseline["interrupt"])]
 

@@ -10,7 +10,7 @@ made for; bold where one exceeds the scatter between the seeds. A mechanism with
 not missed.
 
 DIR/runs.jsonl keeps the results, so that an interrupted run goes on. A run of all mechanisms writes the table into
-firmware/README.md.
+docs/reference/ablation.md.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from salient.experiments.planted import Bug, bugs, build, build_unchanged
 from salient.experiments.results import rounded
 from salient.experiments.scenario import run_scenario
 from salient.machine.cache import machine_image
-from salient.paths import OUT, ROOT
+from salient.paths import OUT, REFERENCE, ROOT
 from salient.progress import Progress, steps_of
 
 TABLE = ROOT / "tests" / "ablation.toml"
-PAGE = ROOT / "firmware" / "README.md"
+PAGE = REFERENCE / "ablation.md"
 BEGIN, END = "<!-- ablation: python -m salient.experiments.ablation -->\n", "<!-- end of ablation -->\n"
 SEEDS = (1, 2, 3)
 PROGRAM = "salient_host"

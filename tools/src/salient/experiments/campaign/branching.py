@@ -30,12 +30,14 @@ SUMMARY = "summary.json"
 HEADING = "Longest time, wherever a fault begins"
 ANCHOR = "longest-time-wherever-a-fault-begins"
 _INTRODUCTION = """\
-By branching ([tools/README.md](../tools/README.md#campaigns-by-seed)), salient on the machine saturating at 40 kHz
-with sensors of 12 and 17 bits: the fault begins in phase a at every control tick of an electrical period at two
-speeds, and at the beginning of a start from each of 360 positions; one that has once been answered after more than 100
-ms, or not, at every 50th tick and every tenth position. A time is the longest from its begin until the first cause,
-with the number of branches that were answered where not all were within 1 s; a violation, one of the rules of
-[the checkers](../emulator/campaign/CHECKERS.md).
+Measured by [branching](../testing/campaigns.md#every-fault-at-every-control-tick): `salient` on the machine
+`saturating`, 40 kHz, sensors of 12 and 17 bits, phase a.
+
+- The fault begins at every control tick of an electrical period at two speeds, and at a start from 360 positions.
+- A fault that was once answered late (100 ms) or never begins at every 50th tick and every tenth position only.
+- A time is the longest from the start of the fault to the first cause. In parentheses: branches answered within 1 s,
+  where not all were.
+- A violation breaks one of the rules of [the checkers](checkers.md).
 """
 
 Rows = dict[str, list[dict[str, Any]]]
@@ -106,7 +108,7 @@ def table(rows: Rows) -> list[str]:
 
 
 def section(rows: Rows) -> str:
-    """That of firmware/FAULTS.md."""
+    """Section of docs/reference/drive-faults.md."""
     return f"## {HEADING}\n\n{_INTRODUCTION}\n" + "".join(f"{line}\n" for line in table(rows))
 
 

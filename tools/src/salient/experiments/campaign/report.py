@@ -1,4 +1,4 @@
-"""The campaign's table in tools/README.md, its picture, and the longest reaction times in firmware/FAULTS.md.
+"""The campaign's page and picture, and the longest reaction times in docs/reference/drive-faults.md.
 
     python -m salient.experiments.campaign.report
 
@@ -15,13 +15,22 @@ from typing import Any
 
 from salient.experiments import fault_table, planted
 from salient.experiments.campaign import branching, same_bits
-from salient.paths import ROOT
+from salient.paths import REFERENCE, ROOT
 
-PAGE = ROOT / "tools" / "README.md"
-PICTURE = ROOT / "tools" / "images" / "campaign.png"
+PAGE = REFERENCE / "campaign.md"
+PICTURE = ROOT / "docs" / "images" / "campaign.png"
 RESULTS = ROOT / "tests" / "campaign"
-_BEGIN = "<!-- campaign: python -m salient.experiments.campaign.report -->\n"
-_END = "<!-- end of campaign -->\n"
+_HEAD = """# Results of campaigns
+
+Generated from `tests/campaign` and `tests/planted.json`; do not edit. The command is `python -m
+salient.experiments.campaign.report`.
+
+A row holds for the worlds and the rules of its commit. [Campaigns](../testing/campaigns.md) has the assumptions.
+
+"""
+_TAIL = """
+![Longest time until the drive reacts to each fault](../images/campaign.png)
+"""
 _MODULE = "build/venv/bin/python -m salient.experiments.campaign"
 
 Note = dict[str, Any]
@@ -63,7 +72,7 @@ def _worlds(name: str, what: str, sharding: str = "") -> tuple[str, str, str]:
              *_rate(f"{name}_rate.json"), f"**{_violations(note)}**"]
     if note["cells"]:
         all_reached = note["cells_reached"] == note["cells"]
-        rest = "" if all_reached else f", the rest in [{name}.json](../tests/campaign/{name}.json)"
+        rest = "" if all_reached else f", the rest in `tests/campaign/{name}.json`"
         parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached{rest}",
                   f"{note['held_by_the_encoder']} drives held at rest by their encoder"]
     healthy = " --healthy" if note["kind"] == "healthy" else ""
@@ -84,7 +93,7 @@ def _branches() -> tuple[str, str, str]:
             f"{of_all['branches']:,} branches at {_commits(notes.values())}; {of_all['virtual_s'] / 3600:.2f} h of "
             f"virtual time; {of_all['branches'] / processor_s:.0f} branches per CPU-second; longest reaction "
             f"{longest['longest_us'] / 1000:.0f} ms (`{branching.label(longest)}`), each in "
-            f"[FAULTS.md](../firmware/FAULTS.md#{branching.ANCHOR}); not always answered: "
+            f"[drive faults](drive-faults.md#{branching.ANCHOR}); not always answered: "
             f"{', '.join(f'`{label}`' for label in unanswered)}; **{of_all['violations']:,} violations**"
             + (f" ({listed})" if listed else ""), f"`{_MODULE}.branching DIR`")
 
@@ -97,7 +106,7 @@ def _planted() -> tuple[str, str, str]:
             f"**{of['found']} of {of['looked']} found** at {note['commit']} in {least_s:.1f} to {most_s:.1f} CPU-"
             f"seconds each, {middle_s:.1f} in the middle, by seeds from 1 to at most {of['last_seed']}; shrunk to at "
             f"most {of['events']} events in at most {of['shrinking_s']:.1f} CPU-seconds; {of['replayed']} "
-            "replayed with equal bits, log and plots; the counts are in [planted.json](../tests/planted.json)",
+            "replayed with equal bits, log and plots; the counts are in `tests/planted.json`",
             "`build/venv/bin/python -m salient.experiments.planted`")
 
 
@@ -125,9 +134,8 @@ def table() -> str:
 
 
 def page() -> str:
-    """The README with the table of the committed results."""
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(_BEGIN)
-    return f"{head}{_BEGIN}\n{table()}\n{_END}{rest.partition(_END)[2]}"
+    """The page of the committed results."""
+    return _HEAD + table() + _TAIL
 
 
 def plot(path: Path) -> None:
@@ -147,11 +155,16 @@ def plot(path: Path) -> None:
     figure.savefig(path, dpi=80)
 
 
-def main() -> int:
-    """Writes pages and picture; returns the exit code."""
+def write_pages() -> None:
+    """Writes the pages of the committed results."""
     PAGE.write_text(page(), encoding="utf-8")
     fault_table.PAGE.write_text(fault_table.with_branches(fault_table.PAGE.read_text(encoding="utf-8")),
                                 encoding="utf-8")
+
+
+def main() -> int:
+    """Writes pages and picture; returns the exit code."""
+    write_pages()
     plot(PICTURE)
     return 0
 
