@@ -48,7 +48,7 @@ def expect_standstill(bench, duration_s: float) -> None:
 
 @pytest.mark.both_transports
 def test_sequence_in_raw_frames_starts_the_drive(bench):
-    """The sequence of the README."""
+    """The sequence of the CAN page."""
     challenge = bench.telemetry
 
     def commands(number: int) -> None:

@@ -1,4 +1,4 @@
-"""The page of measured reactions, firmware/FAULTS.md: complete, bounded, and what the drive does now."""
+"""The page of measured reactions, docs/reference/drive-faults.md: complete, bounded, and what the drive does now."""
 
 from __future__ import annotations
 

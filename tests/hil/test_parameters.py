@@ -144,7 +144,7 @@ def send_set(bench, frames: list[can.Message]) -> dict[str, object]:
 
 @pytest.mark.both_transports
 def test_sequence_in_raw_frames_applies_a_set(bench):
-    """The sequence of the README."""
+    """The sequence of the CAN page."""
     arm_for_configuration(bench, 7)
     result = send_set(bench, set_frames(9, raw(bench, {"current_limit_A": 40.0, "current_trip_A": 60.0})))
     assert (result["operation"], result["status"], result["value"]) == ("set_control", "done", 12 << 8 | 2)

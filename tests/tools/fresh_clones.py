@@ -32,7 +32,7 @@ from salient.cli import make_parser
 from salient.paths import BUILD, ROOT
 from salient.turns import turn_of_commit
 
-DOCUMENTS = ("README.md", "CONTRIBUTING.md", "tools/README.md", "emulator/README.md", "firmware/README.md")
+DOCUMENTS = ("*.md", "docs/**/*.md", "*/README.md")
 BUS = "/tmp/salient.sock"  # of the documents
 NOT_LITERAL = re.compile(r"\b[A-Z]{3,}\b|\.\.\.")
 """Placeholders of the documents, as SEED."""
@@ -54,9 +54,9 @@ UNTIL_INTERRUPTED = ("sim", "view")
 def documented(root: Path) -> dict[str, list[str]]:
     """Command: its command lines, without tools/salient, in the order of the documents."""
     lines: list[str] = []
-    for document in DOCUMENTS:
+    for document in (path for pattern in DOCUMENTS for path in sorted(root.glob(pattern))):
         fenced = False
-        for line in (root / document).read_text(encoding="utf-8").splitlines():
+        for line in document.read_text(encoding="utf-8").splitlines():
             fenced ^= line.startswith("```")
             if fenced and line.startswith("tools/salient ") and not NOT_LITERAL.search(line):
                 lines.append(shlex.join(shlex.split(line, comments=True)[1:]))

@@ -1,4 +1,4 @@
-"""The CAN page, firmware/comms/README.md, computed from its own text: checksums by the parameters that it states, bytes
+"""The CAN pages, docs/can, computed from its own text: checksums by the parameters that it states, bytes
 by the layouts that it states, names and numbers as those of drive.dbc; and its frames, as the drive takes them."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from salient.config import NODE_MAX
 from salient.dbc import attributes
 from salient.paths import ROOT
 
-PAGE = (ROOT / "firmware" / "comms" / "README.md").read_text(encoding="utf-8")
+PAGE = "".join((ROOT / "docs" / "can" / name).read_text(encoding="utf-8") for name in ("protocol.md", "parameters.md"))
 HEX_BYTES = re.compile(r"`((?:[0-9A-F]{2} )+[0-9A-F]{2})`")
 PLACE = re.compile(r"(?:bytes? (\d)(?: (?:to|and) (\d))?)?(?:, )?(?:bits? (\d)(?: (?:to|and) (\d))?)? `(\w+)`")
 FRAME = re.compile(r"`([A-Z_]+)` ((?:\w+ (?:0x[0-9A-F]+|[\w.-]+)(?:, )?)+)")
@@ -178,7 +178,7 @@ def test_limits_are_those_of_the_firmware() -> None:
         assert f"#define {name} {value}\n" in sources, name
     text = " ".join(PAGE.split())
     for said in ("0.2 to 500 ms after the challenge", "less than 10 ms after one", "requested within 500 ms",
-                 "silent for 30 ms", "Four invalid frames", "1, 2 or 3 above that", "third of three frames"):
+                 "silent for 30 ms", "Four invalid frames", "1, 2 or 3 above the last", "third of three frames"):
         assert said in text
 
 

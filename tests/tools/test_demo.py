@@ -141,9 +141,9 @@ def test_ripple_of_the_paper_controller_is_below_the_published_one(demo_metrics)
 
 
 def readme_table(first_cell):
-    """Row -> controller -> cell, of the table in the READMEs that has a row with this first cell. Columns not
+    """Row -> controller -> cell, of the table in the documents that has a row with this first cell. Columns not
     headed by a controller's name are omitted."""
-    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "tools/README.md"))
+    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/machines/file.md"))
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
     (table,) = (table for table in tables if f"\n| {first_cell} |" in table)
     heads, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
@@ -177,7 +177,7 @@ def test_readme_shows_the_metrics_of_the_demo(demo_metrics):
 
 
 def test_picture_of_the_readme_is_that_of_the_demo(demo_folder):
-    shown = ROOT / "tools" / "images" / "torque.png"
+    shown = ROOT / "docs" / "images" / "torque.png"
     equal = shown.read_bytes() == (demo_folder / "figures" / "figure_7.png").read_bytes()
     assert equal, f"copy it to {shown}"  # a difference of the bytes themselves takes minutes to write
 

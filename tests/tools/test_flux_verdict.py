@@ -1,4 +1,4 @@
-"""The table of verdicts that firmware/README.md has is the one that is compiled, monitors/flux_verdict.def."""
+"""The table of verdicts in docs/safety/phases-and-encoder.md is the one that is compiled, monitors/flux_verdict.def."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def compiled() -> list[tuple[str, str]]:
 
 def documented() -> list[tuple[str, str]]:
     """The same of the page."""
-    page = (ROOT / "firmware" / "README.md").read_text(encoding="utf-8")
-    section = page.partition("### Verdicts by flux linkage\n")[2].partition("\n### ")[0]
+    page = (ROOT / "docs" / "safety" / "phases-and-encoder.md").read_text(encoding="utf-8")
+    section = page.partition("## Verdicts by flux linkage\n")[2].partition("\n## ")[0]
     return re.findall(r"^\| (.+) \| `(\w+)` \|$", section, flags=re.MULTILINE)
 
 

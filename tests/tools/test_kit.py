@@ -33,7 +33,7 @@ class Installed:
     wheel: Path
     constraints: Path
     first_output: str
-    """Of the steps of the README."""
+    """Output of the quick start's steps."""
 
     def run(self, *command: str | Path, cwd: Path, path: str = "") -> subprocess.CompletedProcess[str]:
         """Runs a command of the environment; path: where other programs are found."""
@@ -49,17 +49,17 @@ def environment_of(constraints: Path) -> dict[str, str]:
             "PIP_CONSTRAINT": str(constraints)}
 
 
-def steps_of_the_readme() -> str:
-    """The commands from an empty folder to the first test, as the README has them."""
-    text = (ROOT / "README.md").read_text()
-    found = re.search(r"### In a repository of your own\n.*?\n```\n(.*?)```\n", text, re.DOTALL)
+def steps_of_the_quick_start() -> str:
+    """The commands from an empty folder to the first test, as the quick start has them."""
+    text = (ROOT / "docs" / "start" / "ci.md").read_text()
+    found = re.search(r"## 2\. A first test in a repository of your own\n.*?\n```\n(.*?)```\n", text, re.DOTALL)
     assert found is not None
     return found[1]
 
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
-    """The wheel, built, and used as the README says: in an empty folder, with Python and cp in PATH, nothing else."""
+    """The wheel, built, and used as the quick start says: in an empty folder, with Python and cp in PATH alone."""
     folder = tmp_path_factory.mktemp("kit")
     started_s = time.monotonic()
     sys_argv, sys.argv = sys.argv, ["salient", "wheel", "--out", str(folder / "wheel")]
@@ -76,7 +76,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     for program in ("python3", "cp"):
         (folder / "bin" / program).symlink_to(shutil.which(program, path=SYSTEM))
     (folder / "mine").mkdir()
-    steps = steps_of_the_readme().replace("CLONE/out/wheel", str(wheel.parent)).replace("CLONE", str(ROOT))
+    steps = steps_of_the_quick_start().replace("CLONE/out/wheel", str(wheel.parent)).replace("CLONE", str(ROOT))
     done = subprocess.run(["/bin/bash", "-euc", steps], cwd=folder / "mine", capture_output=True, text=True,
                           env={"PATH": str(folder / "bin"), **environment_of(constraints)}, stdin=subprocess.DEVNULL)
     assert done.returncode == 0, f"{steps}\n{done.stdout}\n{done.stderr}"
@@ -103,7 +103,7 @@ def steps(root: Path) -> list[str]:
 
 
 def test_steps_of_the_readme_end_with_the_first_passing_test(installed):
-    assert len(steps_of_the_readme().splitlines()) == 3
+    assert len(steps_of_the_quick_start().splitlines()) == 3
     assert re.fullmatch(r"=+ 1 passed in .*", installed.first_output.splitlines()[-1]), installed.first_output
 
 
@@ -176,7 +176,7 @@ def test_readme_of_the_other_repository_passes_from_its_folder_alone(installed, 
 
 def test_nothing_installs_the_package_by_a_name_that_anybody_could_claim():
     """It is on no registry; pip prefers the highest version of any index to one in a folder."""
-    texts = [ROOT / "README.md", ROOT / "tools" / "README.md", ROOT / "tests" / "README.md", *FOREIGN.rglob("*.md"),
+    texts = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *FOREIGN.rglob("*.md"),
              *FOREIGN.rglob("*.yml"), *(ROOT / "tools" / "src").rglob("*.py")]
     named = re.compile(r"pip install[^\n]*salient-drive(?![^\n]*@ )")
     assert [path.name for path in texts if named.search(path.read_text(encoding="utf-8"))] == []

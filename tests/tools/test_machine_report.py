@@ -9,22 +9,22 @@ import pytest
 
 from salient.machine import file as machine
 from salient.machine.report import describe
-from salient.paths import MACHINES
+from salient.paths import MACHINES, ROOT
 
-READ_ME = (MACHINES / "README.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "machines" / "file.md").read_text(encoding="utf-8")
 
 
 def test_reference_lists_exactly_the_keys_of_a_machine_file():
     tables = [machine.Poles, machine.Winding, machine.Mechanics, machine.Converter, machine.DcLink, machine.Sensors,
               machine.IronLoss, machine.Thermal, machine.Drive, *machine.MAGNETICS.values()]
     keys = {key for table in tables for key in table.model_fields} | {"name"}
-    table = READ_ME.partition("## Keys")[2].partition("## Flux-linkage maps")[0]
+    table = PAGE.partition("## Keys")[2].partition("\n## ")[0]
     rows = [row.split("|")[2] for row in table.splitlines() if row.startswith("| ") and "---" not in row]
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == keys
 
 
 def test_reference_lists_exactly_the_bundled_machines():
-    table = READ_ME.partition("| bundled |")[2].partition("## Keys")[0]
+    table = PAGE.partition("| bundled |")[2].partition("## Keys")[0]
     rows = [row.split("|")[1] for row in table.splitlines() if row.startswith("| `")]
     assert set(re.findall(r"`(\w+)`", "".join(rows))) == {path.stem for path in MACHINES.glob("*.toml")}
 

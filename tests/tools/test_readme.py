@@ -1,7 +1,7 @@
 """Documented commands work as written.
 
-In every README.md and in CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and in the
-root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it would
+In docs/, every README.md and CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and in
+the root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it would
 in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the tests
 themselves. Commands that select tests of this suite list them only: the suite runs them. Buses get a path in the test's
 folder, so that tests can run in parallel.
@@ -22,7 +22,7 @@ from salient.paths import ROOT
 
 BUS = "/tmp/salient.sock"
 FOLDERS = ("firmware", "hal", "emulator", "tools", "tests")
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md",
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
              *sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("README.md"))]
 # The suite itself, and every experiment with its report (tests/tools/test_demo.py).
 NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b", re.MULTILINE)

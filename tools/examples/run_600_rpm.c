@@ -1,4 +1,4 @@
-/* Arms a drive, runs it at 600 r/min for two seconds by default, and stops it: firmware/comms/README.md in C.
+/* Arms a drive, runs it at 600 r/min for two seconds by default, and stops it: docs/can/protocol.md in C.
  *     cc -o /tmp/run_600_rpm tools/examples/run_600_rpm.c && /tmp/run_600_rpm INTERFACE [SECONDS] */
 #include <linux/can.h>
 #include <net/if.h>

@@ -1,4 +1,4 @@
-"""Arms a drive, runs it at 600 r/min for two seconds by default, and stops it: firmware/comms/README.md in Python.
+"""Arms a drive, runs it at 600 r/min for two seconds by default, and stops it: docs/can/protocol.md in Python.
     tools/salient sim --can unix:/tmp/salient.sock                                         in one terminal
     build/venv/bin/python tools/examples/run_600_rpm.py [unix:PATH|INTERFACE [SECONDS]]    in another"""
 import binascii

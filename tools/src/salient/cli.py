@@ -179,7 +179,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                      help="the file (default %(default)s)")
     tab.add_argument("--machine", metavar="NAME|FILE", help="one more machine than the bundled ones: a machine file")
 
-    benchmark = command("benchmark", "the performance numbers of the README: speed, also compared with SciPy and "
+    benchmark = command("benchmark", "performance: speed, also compared with SciPy and "
                         "ngspice; effect of the network")
     benchmark.add_argument("--json", type=Path, metavar="FILE", help="also write the results to a file")
     benchmark.add_argument("--runs", type=_count, default=5, metavar="N", help="runs of each kind (default 5)")

@@ -24,7 +24,8 @@ RESULTS = BUILD / "results"
 TESTS = ROOT / "tests"
 CONFIGURATION = ROOT / "tools" / "pyproject.toml"
 SOURCE_FOLDERS = ("firmware", "hal", "emulator", "tests")
-CHECKED_FOR_SPELLING = ("firmware", "hal", "emulator", "tools", "tests", "cmake", "CMakeLists.txt", ".ci", ".github")
+CHECKED_FOR_SPELLING = ("docs", "firmware", "hal", "emulator", "tools", "tests", "cmake", "CMakeLists.txt", ".ci",
+                        ".github")
 VM_TIMEOUT_S = 1800
 CORES = len(os.sched_getaffinity(0))
 
@@ -105,7 +106,7 @@ def _one(passed: bool) -> Count:
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 def _style() -> Count:
-    """ruff, mypy, clang-format, clang-tidy, limits of C functions and British spelling."""
+    """ruff, mypy, clang-format, clang-tidy, limits of C functions, British spelling and language."""
     count = _one(_succeeds(_tool("ruff"), "check", "--no-cache", "--config", CONFIGURATION, "tools", "tests"))
     count += _one(_succeeds(_tool("mypy"), "--config-file", CONFIGURATION, "--cache-dir", BUILD / "mypy",
                             "--no-error-summary"))
@@ -113,6 +114,7 @@ def _style() -> Count:
     count += _one(_succeeds(_tool("clang-format"), "--dry-run", "-Werror", *sources))
     count += _one(_clang_tidy())
     count += _one(_within_limits())
+    count += _one(_keeps_the_language())
     documents = sorted(ROOT.glob("*.md"))
     count += _one(_succeeds(_tool("codespell"), "--toml", CONFIGURATION, *documents,
                             *(name for name in CHECKED_FOR_SPELLING if (ROOT / name).exists())))
@@ -209,6 +211,16 @@ def _within_limits() -> bool:
     from salient import c_limits
 
     lines = c_limits.violations(c_limits.read_exceptions())
+    for line in lines:
+        _print(line)
+    return not lines
+
+
+def _keeps_the_language() -> bool:
+    """Rules of comments and documents."""
+    from salient import language
+
+    lines = language.violations(language.read_exceptions())
     for line in lines:
         _print(line)
     return not lines

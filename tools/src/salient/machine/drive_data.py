@@ -1,7 +1,7 @@
 """The drive's data of a machine: from the table [drive] of its file, and derived by one rule for all machines.
 
 `derive` fills in what the file leaves out. Every formula is written once, here, and displayed by `salient machine`.
-The reasons and the meaning of the keys are in tools/machines/README.md.
+The reasons and the meaning of the keys are in docs/machines/data.md.
 """
 
 from __future__ import annotations

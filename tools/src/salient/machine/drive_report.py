@@ -21,7 +21,7 @@ def drive_lines(machine: Machine) -> list[str]:
              for each in shown]
     return [f"drive of {machine.name}, from its file or derived", *(line.rstrip() for line in lines),
             f"  {len(data.derivations) - len(shown)} more parameters have the same default for every machine"
-            " (firmware/PARAMETERS.md)"]
+            " (docs/reference/parameters.md)"]
 
 
 def pulse_lines(machine: Machine, data: DriveData) -> list[str]:

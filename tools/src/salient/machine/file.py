@@ -239,7 +239,7 @@ def _parameters(table: dict[str, Any]) -> dict[str, float]:
         row = rows.get(name)
         if row is None:
             raise TextFileError(f"drive.parameters.{shown_key(name)}: unknown key; {close_names(name, rows)}; "
-                                "all are in firmware/PARAMETERS.md")
+                                "all are in docs/reference/parameters.md")
         low, high = row.limits if row.unit in SAME_UNITS else (0.0, 1e6)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not low <= value <= high or (row.fraction_bits == 0 and value != int(value)):

@@ -26,7 +26,7 @@ from salient.experiments.compare.case import (
 )
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 
-# Parameters of the drive that conditions set, by meaning; the numbers are those of firmware/PARAMETERS.md.
+# Parameters of the drive that conditions set, by meaning; the numbers are those of docs/reference/parameters.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
 PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 RESERVE = {"torque_reserve_Nm": 8.0}

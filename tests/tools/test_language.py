@@ -1,0 +1,56 @@
+"""The rules of the language find what they forbid, and nothing else; the hook refuses long subjects."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from salient import language
+from salient.paths import ROOT
+
+LONG = " ".join(["word"] * 31) + "."
+
+
+def breaches(folder: Path, name: str, text: str) -> list[str]:
+    """Breaches of a file of a repository that has no other."""
+    (folder / "firmware").mkdir(exist_ok=True)
+    (folder / "firmware" / name).write_text(text, encoding="utf-8")
+    return [breach for _, _, breach in language.breaches(folder)]
+
+
+@pytest.mark.parametrize(("name", "text", "found"), [
+    ("a.c", "/* Of the drive. */\n", ["begins with 'Of the'"]),
+    ("a.h", "int a; // What it is\n", ["begins with 'What it'"]),
+    ("a.py", '"""What a drive does."""\n# Of one.\n', ["begins with 'What a'", "begins with 'Of one'"]),
+    ("a.cpp", "/* That of the drive. */ /* Those of it. */\n", ["begins with 'That of'", "begins with 'Those of'"]),
+    ("a.c", "/* A torque that is none; there is none. */\n", ["'is none'"]),
+    ("a.c", "/* Offset of the drive. */ /* Often. Whatever. */\n", []),
+    ("a.md", "| of the drive | x |\n\n- What it is\n", ["begins with 'of the'", "begins with 'What it'"]),
+    ("a.md", "The speed is that of the rotor.\n", ["'that of'"]),
+    ("a.md", f"Short. {LONG}\n", ["31 words: word word word word word word ..."]),
+    ("a.md", f"```\n{LONG}\n```\n", []),
+    ("a.md", f"- {' '.join(['word'] * 20)}\n- {' '.join(['word'] * 20)}\n", []),
+    ("a.md", f"`{LONG}` is [code]({'x' * 9}).\n", [])])
+def test_a_rule_finds_what_it_forbids(tmp_path: Path, name: str, text: str, found: list[str]) -> None:
+    assert breaches(tmp_path, name, text) == found
+
+
+def test_an_exception_has_a_reason_and_is_needed(tmp_path: Path) -> None:
+    breaches(tmp_path, "a.c", "/* Of the drive. */\n")
+    name = "firmware/a.c: begins with 'Of the'"
+    assert language.violations({name: "a quotation"}, tmp_path) == []
+    assert language.violations({name: " "}, tmp_path) == ["firmware/a.c:1: begins with 'Of the'"]
+    assert language.violations({name: "a", "b": "c"}, tmp_path) == [
+        "b: an exception of language.toml that is not needed"]
+
+
+def test_the_hook_refuses_a_subject_of_73_characters() -> None:
+    spec = importlib.util.spec_from_file_location("commit_subject", ROOT / "tools" / "commit_subject.py")
+    assert spec and spec.loader
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    assert hook.refusal(f"# comment\n{'x' * 72}\n\n{'y' * 90}\n") == ""
+    assert hook.refusal("x" * 73) == f"subject has 73 characters, at most 72: {'x' * 73}"
+    assert hook.refusal(f"Merge branch {'x' * 73}") == ""

@@ -1,0 +1,111 @@
+"""Rules of the language of comments and documents that a list of words (tools/spelling/en_gb.txt) cannot state;
+exceptions by name, each with its reason, are in tools/spelling/language.toml.
+
+- A comment, a row of a table and an item of a list do not begin with "Of" or "What".
+- "none" is no predicate ("is none", "are none"), except after "there".
+- "that of" and "those of" do not open a comment, and are not written in documents: the noun is said.
+- A sentence of a document has at most 30 words.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from salient.paths import ROOT
+
+EXCEPTIONS = ROOT / "tools" / "spelling" / "language.toml"
+FOLDERS = ("firmware", "hal", "emulator", "tools", "tests", "docs")
+SOURCES = (".c", ".h", ".cpp", ".py", ".def")
+NOT_OURS = ("tools/src/salient/view/page/vendor/", "emulator/fmi/fmi3_")
+GENERATED = "docs/reference/"
+"""Pages whose sentences are the comments of DBCs, tables and parsers."""
+WORDS_MAX = 30
+
+_COMMENT = re.compile(r"""(?:/\*+|//|(?<!['"])#(?!["'])|\"\"\")\s?(?P<words>[A-Z]\w*(?: \w+)?)""")
+_CELL = re.compile(r"^(?:\| |[-*] |\d+\. )(?P<words>\w+(?: \w+)?)")
+_NONE = re.compile(r"(?<!there )\b(?:is|are) none\b")
+_THAT_OF = re.compile(r"\b(?:that|those) of\b", re.IGNORECASE)
+_OPENINGS = ("of", "what")
+
+
+def _opens_wrongly(words: str) -> bool:
+    return words.lower().split()[0] in _OPENINGS or _THAT_OF.fullmatch(words) is not None
+
+
+def _in_source(text: str) -> Iterator[tuple[int, str]]:
+    for number, line in enumerate(text.splitlines(), 1):
+        yield from ((number, f"begins with '{found['words']}'") for found in _COMMENT.finditer(line)
+                    if _opens_wrongly(found["words"]))
+        yield from ((number, f"'{found[0]}'") for found in _NONE.finditer(line))
+
+
+def _in_document(text: str, *, generated: bool) -> Iterator[tuple[int, str]]:
+    for number, line in enumerate(text.splitlines(), 1):
+        found = _CELL.match(line)
+        if found and _opens_wrongly(found["words"]):
+            yield number, f"begins with '{found['words']}'"
+        yield from ((number, f"'{found[0]}'") for found in _NONE.finditer(line))
+        if not generated:
+            yield from ((number, f"'{found[0]}'") for found in _THAT_OF.finditer(line))
+    if not generated:
+        for number, sentence in sentences(text):
+            words = len(sentence.split())
+            if words > WORDS_MAX:
+                yield number, f"{words} words: {' '.join(sentence.split()[:6])} ..."
+
+
+def sentences(text: str) -> Iterator[tuple[int, str]]:
+    """Number of the first line, and text, of each sentence of a document. An item of a list ends
+    one, a cell of a table and a semicolon in it, too; code and the target of a link are one word."""
+    for number, block in _blocks(text):
+        plain = re.sub(r"`[^`]*`", "code", block)
+        plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", plain)
+        yield from ((number, sentence) for sentence in re.split(r"(?<=[.!?])\s+", plain) if sentence.strip())
+
+
+def _blocks(text: str) -> Iterator[tuple[int, str]]:
+    """Paragraphs, items of lists and cells of tables, with the number of their first line."""
+    fenced, first, block = False, 0, ""
+    for number, line in enumerate([*text.splitlines(), ""], 1):
+        fence = line.startswith("```")
+        row = line.startswith("|")
+        fresh = row or fence or fenced or not line.strip() or re.match(r"[-*] |\d+\. |#|<!--|    ", line) is not None
+        if fresh and block:
+            yield first, block
+            block = ""
+        fenced ^= fence
+        if row:
+            yield from ((number, part.strip()) for cell in line.split("|") for part in cell.split("; "))
+        elif not (fence or fenced or line.startswith(("#", "<!--", "    "))) and line.strip():
+            first, block = (number, line) if not block else (first, f"{block} {line.strip()}")
+
+
+def breaches(root: Path = ROOT) -> Iterator[tuple[str, int, str]]:
+    """File, line and breach of a rule."""
+    files = [path for folder in FOLDERS for path in (root / folder).rglob("*") if path.suffix in (*SOURCES, ".md")]
+    for path in sorted([*files, root / "README.md", root / "CONTRIBUTING.md"]):
+        name = str(path.relative_to(root))
+        if path.is_file() and not name.startswith(NOT_OURS):
+            text = path.read_text(encoding="utf-8")
+            found = _in_document(text, generated=name.startswith(GENERATED)) if path.suffix == ".md" \
+                else _in_source(text)
+            yield from ((name, number, breach) for number, breach in found)
+
+
+def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, str]:
+    """Names ("FILE: BREACH"), each with the reason why it may be."""
+    with path.open("rb") as file:
+        return tomllib.load(file)
+
+
+def violations(exceptions: Mapping[str, str], root: Path = ROOT) -> list[str]:
+    """One line for each breach without a reason, and for each exception that is not needed any more."""
+    found = list(breaches(root))
+    lines = [f"{name}:{number}: {breach}" for name, number, breach in found
+             if not exceptions.get(f"{name}: {breach}", "").strip()]
+    needed = {f"{name}: {breach}" for name, _, breach in found}
+    return lines + [f"{name}: an exception of {EXCEPTIONS.name} that is not needed"
+                    for name in exceptions if name not in needed]
