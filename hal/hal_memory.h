@@ -8,7 +8,7 @@
 
 #include "hal.h"
 
-/* What the start of a program writes to all unused words of its stack. */
+/* Pattern that the start of a program writes to all unused words of its stack. */
 #define HAL_STACK_UNUSED UINT32_C(0x57A6CE11)
 
 typedef struct {

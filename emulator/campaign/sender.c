@@ -48,7 +48,7 @@ static int32_t reference_of(const world_t *world, double rpm) {
     return (int32_t)floor(rpm / world->machine->command_lsb_rpm + 0.5);
 }
 
-/* Of 24 bits; at least an LSB beyond the range. */
+/* Reference of 24 bits; at least an LSB beyond the range. */
 static int32_t reference_beyond(const world_t *world, double part) {
     const int32_t largest = reference_of(world, world->machine->speed_command_max_rpm);
     const int32_t beyond = (int32_t)fmin(fmax(floor(fabs(part) * largest), largest + 1.0), 8388607.0);
@@ -310,7 +310,7 @@ static void listen(sender_t *sender, const struct can_frame *frame, uint64_t tim
     sender->on_frame(sender->context, time_ns, frame->can_id, frame->data);
 }
 
-/* What is on the bus, and the true state: not the answers of the bench, which depend on how a client divides time. */
+/* Frames on the bus, and the true state: not the answers of the bench, which depend on how a client divides time. */
 static bool counts(const transport_frame_t *frame) {
     if (frame->size != CAN_MTU) {
         return false;

@@ -28,7 +28,7 @@ typedef struct {
     bool in_sequence; /* of the honest client, or by chance as if it were */
 } sender_frame_t;
 
-/* What a frame on the bus was to the world, by its sender's own account. */
+/* Meaning of a frame on the bus for the world, by its sender's own account. */
 typedef struct {
     bool genuine;  /* of the client that arms the drive, or in its sequence by chance; not a replay of it */
     bool other;    /* of the second sender */

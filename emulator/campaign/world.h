@@ -53,7 +53,7 @@ typedef enum {
     WORLD_HOSTILE_SORTS
 } world_hostile_t;
 
-/* Of the frames of the set. */
+/* Check in the frames of the set. */
 enum { WORLD_DEGRADED_RIGHT_CHECK, WORLD_DEGRADED_WRONG_CHECK };
 
 /* As DRIVE_COMMAND.request. */

@@ -221,7 +221,7 @@ bool world_is_faultless(uint64_t seed) {
     return seeded_unit(seed, STREAM_REQUEST, 14) < FAULTLESS_SHARE;
 }
 
-/* Of two phases, one after the other. */
+/* Loss of two phases, one after the other. */
 bool world_loses_two(uint64_t seed) {
     return seeded_unit(seed, STREAM_REQUEST, 4) < DEGRADED_SHARE / 2.0 &&
            seeded_unit(seed, STREAM_REQUEST, 12) < SECOND_LOSS_SHARE;

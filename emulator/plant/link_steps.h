@@ -91,7 +91,7 @@ static inline link_result_t link_step(const link_t *link, double step_s) {
 static inline void link_book(link_t *link, double step_s, const link_result_t *result) {
     const double change_V = result->end_V - link->voltage_V;
     const double middle_V = link->voltage_V + 0.5 * change_V;
-    /* Of a parabola. */
+    /* Integral over a parabola. */
     link->square_V2s +=
         middle_V * (2.0 * result->area_Vs - middle_V * step_s) + (1.0 / 12.0) * step_s * (change_V * change_V);
     link->area_Vs += result->area_Vs;

@@ -210,7 +210,7 @@ static void add_energies(plant_t *plant, const rotor_step_t *rotor, const sums_t
         plant->phase_copper_J[phase] += sums->copper_J[phase];
         plant->phase_converter_J[phase] += sums->converter_J[phase];
     }
-    /* Of a speed whose course is a straight line. */
+    /* Mean square of a speed whose course is a straight line. */
     const double speed2_rad2_s =
         turn_rad * turn_rad / rotor->length_s + rotor->length_s * gain_rad_s * gain_rad_s / 12.0;
     const double friction_J = plant->friction_Nm_s * speed2_rad2_s;

@@ -68,7 +68,7 @@ typedef struct {
     double link_swing_s2_H;         /* of a step of a phase on a DC link: its square by the incremental inductance */
 } plant_limits_t;
 
-/* Of which compare values the patterns of the phases are. */
+/* Compare values behind the patterns of the phases. */
 typedef struct {
     hal_pwm_compare_t compare;
     uint16_t period_ticks; /* 0: of none */

@@ -51,7 +51,7 @@ void board_pwm_clear_break(board_t *board) {
 
 /* Start of a period: compare values that were not renewed twice in succession, or a break, open the switches. */
 static void drive_gates(board_t *board, bool busy) {
-    /* What an interrupt that still runs has written counts at its end. */
+    /* Values that an interrupt still running has written count at its end. */
     if (busy || !board->renewed) {
         board->periods_unrenewed++;
     } else {

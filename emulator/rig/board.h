@@ -60,7 +60,7 @@ typedef struct {
     hal_reset_cause_t reset_cause;
 
     nvm_t nvm; /* keeps its content in a reset */
-    /* Of the true random number generator, from the seed of the bench: a reset of the board does not restart it. */
+    /* True random number generator, from the seed of the bench: a reset of the board does not restart it. */
     uint64_t random_state;
 
     plant_t *plant;

@@ -41,7 +41,7 @@ static double sine_Nm(const load_t *load) {
     return load->sine_amplitude_Nm * sine;
 }
 
-/* Of the middle of the coming step, so that the staircase is not late on average. */
+/* Taken in the middle of the coming step, so that the staircase is not late on average. */
 static double profile_Nm(const load_t *load) {
     if (load->profile_Nm == 0.0 || load->profile_values == 0) {
         return 0.0;

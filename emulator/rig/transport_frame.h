@@ -17,8 +17,8 @@ typedef struct {
     };
 } transport_frame_t;
 
-/* Validates a frame of `received` bytes; false when it is none. Zeroes reserved fields and data beyond the length, so
- * that equal frames have equal bytes. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
+/* Validates a frame of `received` bytes; false when it is no frame. Zeroes reserved fields and data beyond the length,
+ * so that equal frames have equal bytes. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
 bool transport_frame_accept(transport_frame_t *frame, size_t received);
 
 /* Bits of the identifiers of a rig that have the node number of its drive; not those of time, which all drives of a bus

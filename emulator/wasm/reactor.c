@@ -196,7 +196,7 @@ EXPORT(time_ns) double time_ns(void) {
     return (double)rig.board.time_ns; /* exact for a hundred days */
 }
 
-/* Of the true state at each control interrupt and of each frame with its time, since the start. */
+/* Hash of the true state at each control interrupt and of each frame with its time, since the start. */
 EXPORT(hash_high) uint32_t hash_high(void) {
     return (uint32_t)(hash >> 32);
 }

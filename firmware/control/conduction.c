@@ -25,7 +25,7 @@ _Static_assert(CONDUCTION_ANGLES + 1 == CONDUCTION_STEPS, "the last step");
 /* Least overlap of windows, 2^-32 electrical rev: 2 degrees. */
 #define OVERLAP_MIN 0x016C16C1u
 
-/* Of a pulse, 8 degrees. */
+/* Overlap of a pulse, 8 degrees. */
 #define PULSE_OVERLAP_MIN (4 * OVERLAP_MIN)
 
 /* Rate of the braking limit's slow part, from that of the advance, Q1.30 to Q1.15: 5/8 in a second by each fold-back

@@ -208,8 +208,8 @@ static inline bool conduction_at_rest(int32_t speed_q22) {
 }
 
 /* Limit of the braking torque's magnitude by what the DC link can take, from the voltage of the present period: N m,
- * Q7.24, INT32_MAX where it is none. Faster than the limits of an update, in which the fields of the phases alone could
- * fill the link. */
+ * Q7.24, INT32_MAX where there is none. Faster than the limits of an update, in which the fields of the phases alone
+ * could fill the link. */
 static inline int32_t conduction_braking_q24(const conduction_parameters_t *parameters, int32_t dc_link_voltage_q6) {
     const int32_t room_q6 = parameters->full_link_q6 - dc_link_voltage_q6;
     return room_q6 > parameters->full_link_range_q6 ? INT32_MAX

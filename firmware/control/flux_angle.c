@@ -9,7 +9,7 @@
 #define STEP_BITS 26
 #define HALF_STEP (UINT32_C(1) << (STEP_BITS - 1))
 
-/* Of the sums: 2^11 samples, 0.45 s of a phase that conducts for nearly half of the time and has ten a millisecond.
+/* Sums over 2^11 samples, 0.45 s of a phase that conducts for nearly half of the time and has ten a millisecond.
  * They are solved after each 256, from 1.1 s on: an encoder that is displaced by more than can be learned has been
  * found before (monitors/phase_balance.h). */
 #define FORGET_BITS 11

@@ -23,10 +23,10 @@
 #include "control/flux_residual.h"
 #include "hal.h"
 
-/* Of c, b, a and delta, in the order of elimination, and of the left side. */
+/* Courses of c, b, a and delta, in the order of elimination, and of the left side. */
 #define FLUX_ANGLE_COURSES 5
 
-/* Of a phase; all zero at the start. */
+/* Sums of a phase; all zero at the start. */
 typedef struct {
     int64_t sum[FLUX_ANGLE_COURSES][FLUX_ANGLE_COURSES];  /* of products, upper triangle */
     uint32_t samples;                                     /* modulo 2^32 */

@@ -50,7 +50,7 @@ typedef struct {
     bool off[HAL_PHASES_MAX];             /* both switches, in the period that begins with the sample and the next */
 } flux_sample_t;
 
-/* Of a phase. */
+/* Residual of a phase. */
 typedef struct {
     /* At the sample: */
     uint32_t angle;        /* less the misalignment, 2^-32 electrical rev */
@@ -106,7 +106,7 @@ void flux_residual_follow(flux_residual_t *residual, int32_t correction_q29[HAL_
 int32_t flux_residual_least_q29(const flux_residual_t *residual, unsigned index);
 int32_t flux_residual_most_q29(const flux_residual_t *residual, unsigned index);
 
-/* Of the tables, up to `width` from a distance from the unaligned position (phase_map.h), 2^-32 electrical rev; with
+/* Tables' range, up to `width` from a distance from the unaligned position (phase_map.h), 2^-32 electrical rev; with
  * the width HALF_REV at any angle. The least at one current, the largest at another, A, Q7.9. */
 flux_band_t flux_residual_band(uint32_t distance, uint32_t width, int32_t least_q9, int32_t most_q9);
 

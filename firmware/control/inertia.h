@@ -30,7 +30,7 @@
 
 #include "control/load_observer.h"
 
-/* What of the control laws is in proportion to the inertia or its reciprocal. */
+/* Parts of the control laws in proportion to the inertia or its reciprocal. */
 typedef struct {
     load_observer_inertia_t observer;
     int32_t reaching_gain_q24; /* J k of speed_smc.h, N m s/rad, Q7.24 */

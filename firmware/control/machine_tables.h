@@ -115,7 +115,7 @@ typedef struct {
     uint8_t angle_bin_row[MACHINE_ANGLE_BINS]; /* row in which each angle bin begins */
     machine_format_t torque_format;
     machine_format_t flux_format;
-    /* Of the interval that begins at the row; 0 in the last row. */
+    /* Curvature in the interval that begins at the row; 0 in the last row. */
     int8_t curvature[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     int16_t node[MACHINE_COLUMNS * MACHINE_TO_NEXT_COLUMN];
     uint32_t pulse_index_scale;                     /* index in Q8 = ((|speed_q22| * scale) >> 32) / voltage_q6 */
@@ -129,7 +129,7 @@ typedef struct {
      * needs that, theta_t is where psi at the limit falls fastest. */
     uint16_t braking_end[MACHINE_PULSE_POINTS];  /* theta_t past the aligned position, 2^-16 electrical rev */
     uint16_t braking_flux[MACHINE_PULSE_POINTS]; /* psi_t, Wb, Q2.13 (Q2.29 >> 16) */
-    /* Of storage/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
+    /* Rows of storage/parameters.def, by index: default, raw, and fraction bits of a raw value in the SI unit. */
     int32_t parameter_default[MACHINE_PARAMETERS_MAX];
     int8_t parameter_fraction_bits[MACHINE_PARAMETERS_MAX];
     uint32_t control_rate_min_hz; /* 25 periods in an electrical revolution at a highest speed that the file states */

@@ -33,8 +33,8 @@
  * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend. A
  * trend in it withholds this stage alone; the load moves when there is a trend in the steady stage as well.
  *
- * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is none of
- * the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
+ * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is not one
+ * of the load: none counts until the first stage after the trigger has ended, which removes the step, and three time
  * constants more, which remove the trend. What the step withheld before its trigger is released then, once. */
 #ifndef CONTROL_MOVING_LOAD_H
 #define CONTROL_MOVING_LOAD_H

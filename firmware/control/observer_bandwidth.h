@@ -145,7 +145,7 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
                                                      const observer_bandwidth_limits_t *limits, int32_t innovation,
                                                      const bool *from_edge);
 
-/* Of an adaptive bandwidth: updates the statistics with a sample after its observer_bandwidth_step, and sets the limits
+/* Adaptive bandwidth: updates the statistics with a sample after its observer_bandwidth_step, and sets the limits
  * of the next one.
  * angle_step: rotation per period, magnitude, 2^-32 rev; rounding_q4: of moving_load_rounding_q4; withheld_stages: of
  * moving_load_step.

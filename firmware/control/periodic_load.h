@@ -50,7 +50,7 @@ typedef struct {
     uint32_t pitch;          /* values of a pole pitch */
 } periodic_load_parameters_t;
 
-/* What this turn does to the profile. */
+/* Effect of this turn on the profile. */
 typedef enum {
     PERIODIC_LOAD_CLEAR, /* all values become 0; the torque is 0 from the start */
     PERIODIC_LOAD_KEEP,

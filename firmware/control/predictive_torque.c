@@ -177,7 +177,7 @@ static int32_t share_of(int32_t torque_q24, int32_t share_q15) {
     return share_q15 == ONE_Q15 ? torque_q24 : 4 * fixed_multiply_high(torque_q24, share_q15 << 15);
 }
 
-/* What all phases have in common. */
+/* Values that all phases have in common. */
 typedef struct {
     uint32_t flux_step_max;  /* that a period of Vdc adds or removes, in units of the tables */
     uint32_t angle_step_q24; /* rotation per period, 2^-24 electrical rev, rounded up */

@@ -68,7 +68,7 @@ typedef struct {
     load_observer_gains_t edge; /* when the count changes, and when the prediction leaves it late */
 } slow_counts_t;
 
-/* What the coming sample needs; the rest has a meaning while counts are slow. */
+/* Values that the coming sample needs; the rest has a meaning while counts are slow. */
 typedef struct {
     bool slow;
     bool late;

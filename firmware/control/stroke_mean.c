@@ -14,7 +14,7 @@
 /* h of a phase that has not been seen since the load has changed. */
 #define HALF_UNKNOWN INT32_MIN
 
-/* Of the number of strokes in Q32. */
+/* Half a stroke, number of strokes in Q32. */
 #define HALF_STROKE (UINT32_C(1) << 31)
 
 stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_rate_hz) {

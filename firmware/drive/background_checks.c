@@ -8,7 +8,7 @@
 #include "interrupts/deferred.h"
 #include "interrupts/unmasked_read.h"
 
-/* Of phases, encoder, stall and STO lines: in each 4 control periods at 40 kHz; in each one while a phase or the
+/* Checks of phases, encoder, stall and STO lines: in each 4 control periods at 40 kHz; in each one while a phase or the
  * encoder is in doubt, so that it is found hardly later than with a check in each period. Heat is sampled at every
  * call, because currents may repeat after a few periods. */
 #define CHECKS_PER_MS 10u
@@ -26,7 +26,7 @@ COLD static void read_stall_input(const control_state_t *control, stall_input_t 
     };
 }
 
-/* What the checks need of the last control period: its sample, the integrals of the voltage at it, the speed law. */
+/* Inputs of the checks from the last control period: its sample, the integrals of the voltage at it, the speed law. */
 typedef struct {
     stall_input_t stall;
     flux_sample_t flux;

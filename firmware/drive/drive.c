@@ -271,7 +271,7 @@ COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telem
     hal_critical_leave(drive->hal);
 }
 
-/* What is due of the telemetry. */
+/* Telemetry that is due. */
 COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
     if (!comms_telemetry_due(&drive->comms, time_us)) {
         return;

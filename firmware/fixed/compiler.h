@@ -21,7 +21,7 @@
  * salient. */
 #define IN_REGISTER(value) __asm__("" : "+r"(value))
 
-/* Of a type through which objects of any other type may be read. The self-test reads words without a call of memcpy for
+/* Type through which objects of any other type may be read. The self-test reads words without a call of memcpy for
  * each: 660 instructions of each pass of the background. */
 #define MAY_ALIAS __attribute__((may_alias))
 

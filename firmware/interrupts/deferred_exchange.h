@@ -59,13 +59,13 @@ typedef struct {
     int32_t torque_shortfall_q24;
 } deferred_input_t;
 
-/* Of torque control by flux linkage. */
+/* Results for torque control by flux linkage. */
 typedef struct {
     unsigned conduction;                  /* index of the angles, conduction_angles() */
     int32_t misalignment[HAL_PHASES_MAX]; /* to subtract from the angle of each phase, 2^-32 electrical rev */
 } deferred_predictive_results_t;
 
-/* Of the speed and torque laws; all zero outside RUN. */
+/* Results of the speed and torque laws; all zero outside RUN. */
 typedef struct {
     int32_t speed_reference_q22;  /* after the ramp, rad/s, Q9.22; 0 in torque mode */
     int32_t speed_law_torque_q24; /* speed law, torque offset, periodic load, N m, Q7.24 */

@@ -10,7 +10,7 @@
 void measure(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred,
              const control_sample_t *sample);
 
-/* What the currents imply, by the machine's tables: torque at the angle of each phase, corrected by its misalignment
+/* Implied by the currents, by the machine's tables: torque at the angle of each phase, corrected by its misalignment
  * (2^-32 electrical rev), with the roles of the phases; with predictive torque control torque and flux linkage at the
  * planned angle; the sum times the scale of the tables (table_scale.h). failed: a check has, which opens the switches;
  * the torque is not looked up then, but 0, and the period that records a fault is no longer than a period of the run:

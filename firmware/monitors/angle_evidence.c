@@ -13,7 +13,7 @@
 /* Error of the flux linkage by the shape of the tables: 1/64. */
 #define SHAPE_SHIFT 6
 
-/* Once the rotor has been seen to move in a run, a larger error of the voltage is none, twice that and 1/64 of the
+/* Once the rotor has been seen to move in a run, a larger error of the voltage is tolerated, twice that and 1/64 of the
  * DC-link voltage: the currents follow the torque, and their pulses change. */
 #define MOVING_FACTOR 2
 #define PART_SHIFT 6
@@ -52,7 +52,7 @@
 #define AGE_SHIFT 7
 
 /* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the error of the
- * voltage that is none, twice, in rad: 4 degrees, Q20. */
+ * tolerated voltage, twice, in rad: 4 degrees, Q20. */
 #define TWICE_ANGLE_Q20 73204
 
 /* 2^20 rad/s^2: 52 N m on 5e-5 kg m^2. */
@@ -85,7 +85,7 @@ typedef struct {
     const angle_evidence_parameters_t *parameters;
     const flux_residual_t *residual;
     uint32_t electrical;      /* middle of the encoder's count, 2^-32 electrical rev */
-    int64_t moving_drift_q29; /* error of the voltage in a period that is none, Wb, Q2.29 */
+    int64_t moving_drift_q29; /* tolerated error of the voltage in a period, Wb, Q2.29 */
     int64_t drift_q29;        /* the same as long as the rotor has not been seen to move in this run */
 } common_t;
 
@@ -119,7 +119,7 @@ static flux_band_t band_of(const flux_residual_phase_t *phase, uint32_t distance
                               phase->current_q9 + current_error_q9);
 }
 
-/* Error that is none of an integral that is too small, by a cold winding, or too large, by a warm one, Wb, Q2.29, since
+/* Tolerated error of an integral that is too small, by a cold winding, or too large, by a warm one, Wb, Q2.29, since
  * the phase was without current. */
 static int32_t drift_since_zero_q29(const common_t *common, const flux_residual_phase_t *phase, bool small) {
     const uint32_t age = age_of(common, phase);

@@ -25,7 +25,7 @@
 #include "hal.h"
 #include "monitors/flux_evidence.h"
 
-/* Error of the encoder's angle that is none, mechanical degrees: eccentricity and alignment; where the misalignment is
+/* Tolerated error of the encoder's angle, mechanical degrees: eccentricity and alignment; where the misalignment is
  * learned, what the learning takes. */
 #define ANGLE_EVIDENCE_DEG 2u
 #define ANGLE_EVIDENCE_LEARNED_DEG 4u
@@ -40,13 +40,13 @@ typedef struct {
     uint32_t half_count;    /* of the encoder, 2^-32 electrical rev */
     uint32_t middle;        /* of a count, 2^-32 rev */
     int32_t advance_min;    /* of a rotor that soon brings the next phase, 2^-32 rev */
-    uint32_t angle_max;     /* error of the angle that is none, 2^-32 electrical rev */
+    uint32_t angle_max;     /* tolerated error of the angle, 2^-32 electrical rev */
     int32_t flux_error_q29; /* of the integral in a period, angle_evidence_flux_error_q29() */
     uint32_t rate_hz;       /* of the control periods */
     int32_t current_min_q9; /* of a phase that is checked, A, Q7.9 */
 } angle_evidence_parameters_t;
 
-/* Of a phase. */
+/* Evidence of a phase. */
 typedef struct {
     bool referred;           /* current to zero_at are set */
     bool shown;              /* the angle was contradicted for long enough, last in the period shown_at */
@@ -82,7 +82,7 @@ typedef struct {
     angle_evidence_phase_t phase[HAL_PHASES_MAX];
 } angle_evidence_t;
 
-/* Error of the integral that is none, per control period, Wb, Q2.29: half of the mean back-EMF of a phase, at a current
+/* Tolerated error of the integral, per control period, Wb, Q2.29: half of the mean back-EMF of a phase, at a current
  * in A, Q7.9, when a free rotor has turned by 2 degrees at an acceleration, in the unit of speed per s. A rotor that
  * accelerates more slowly is found later, but after the same angle. angle_step_q32: as in load_observer_model_t.
  * [background] */

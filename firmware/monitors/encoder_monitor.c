@@ -8,7 +8,7 @@
 #define WINDOW_SHIFT 11
 
 /* Travel in a window at the limit of the speed up to which a larger one is seen: 7/16 of a turn. A sixteenth more, and
- * a count, are below the half turn beyond which travel appears smaller than it is: never as over-speed that is none.
+ * a count, are below the half turn beyond which travel appears smaller than it is: never as a false over-speed.
  * The highest limit, 38400 r/min, has windows of up to 0.68 ms. */
 #define TRAVEL_SEEN (HALF_REV / 8u * 7u)
 

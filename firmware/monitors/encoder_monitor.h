@@ -1,7 +1,7 @@
 /* Encoder against its own counts, over half a millisecond.
  *
  *   over_speed    a sixteenth above the limit; or from a thirty-second below it when the observer's speed, which is
- *                 finer, is above. Of the observer alone it is none: after an edge that came too early, or with a rotor
+ *                 finer, is above. The observer alone shows none: after an edge that came too early, or with a rotor
  *                 on which it has just begun, its speed is not the rotor's.
  *   turned_round  from one direction to the other faster than a rotor can, in the last quarter of a second
  *

@@ -5,8 +5,8 @@
  * within STALL_TIME_US, the torque reference is within a sixteenth of its limit in the direction of the speed
  * reference, and in STALL_TIME_US the speed has become neither higher nor lower than before by a 128th of the
  * reference: a rotor that swings about a point is stalled, one that a larger load drives backwards faster and faster
- * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is none. A reference of 0
- * is held as long as the currents can be. A reference that changes its sign begins anew.
+ * leads to over-speed instead. A start that takes up to 12 s from standstill to the reference is no stall. A reference
+ * of 0 is held as long as the currents can be. A reference that changes its sign begins anew.
  *
  * Or, whatever the torque: for STALL_SWING_US and the time in which the reference turns by three strokes, at most 12 of
  * them a STALL_SWING_US, the rotor has come no further than it had been, by half a stroke in either direction, nor has

@@ -1,4 +1,4 @@
-/* What survives a reset: the parameters, the last faults and the number of starts, each in a ring of two pages
+/* Memory that survives a reset: the parameters, the last faults and the number of starts, each in a ring of two pages
  * (storage/nvm_ring.h).
  *
  * Writing is in the background, one operation of the memory in a call of nvm_store_step and none in RUN, because flash

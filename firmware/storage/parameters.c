@@ -171,7 +171,7 @@ static parameters_verdict_t check_direction(const parameters_t *present, const i
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }
 
-/* Of a drive without its supply nothing can be said. */
+/* Nothing can be said about a drive without its supply. */
 static parameters_verdict_t check_supply(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                          int32_t voltage_q6) {
     const bool supplied = voltage_q6 >= present->values[PARAMETER_UNDER_VOLTAGE_V] &&

@@ -56,7 +56,7 @@ void parameters_set_controller(parameters_t *parameters, int32_t controller);
 /* The default of this drive: that of the machine, but for the controller. index 0..PARAMETER_COUNT-1. */
 int32_t parameters_default(const parameters_t *parameters, unsigned index);
 
-/* What a set of parameters is checked against. */
+/* Values that a set of parameters is checked against. */
 typedef struct {
     bool running;               /* the drive runs or is about to: tunable parameters only */
     int32_t dc_link_voltage_q6; /* measured, V, Q9.6 */

@@ -1,4 +1,4 @@
-/* What the control interrupt calls: with link-time optimisation, unlike board.c, so that it is inlined there. */
+/* Callees of the control interrupt: with link-time optimisation, unlike board.c, so that it is inlined there. */
 #include "hal_interrupt.h"
 #include "qemu/hal_qemu.h"
 #include "qemu/mps2_an386/timer.h"
