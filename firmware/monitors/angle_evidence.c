@@ -51,8 +51,8 @@
 /* Time without a zero of the current after which an integral is too old to contradict the angle: 1/128 s. */
 #define AGE_SHIFT 7
 
-/* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the error of the
- * tolerated voltage, twice, in rad: 4 degrees, Q20. */
+/* Mechanical angle in which a free rotor at the torque limit reaches the speed whose back-EMF is the tolerated
+ * error of the voltage, twice, in rad: 4 degrees, Q20. */
 #define TWICE_ANGLE_Q20 73204
 
 /* 2^20 rad/s^2: 52 N m on 5e-5 kg m^2. */

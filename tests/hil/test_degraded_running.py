@@ -59,7 +59,7 @@ def test_lost_phase_under_load_leaves_the_speed_at_its_reference(make_bench, mac
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("machine", ["saturating", "finite_element"])
 def test_reported_torque_is_what_the_other_phases_make(make_bench, machine, controller):
-    """Of a shaft that is held below the reference, so that the torque is at its limit."""
+    """Torque of a shaft that is held below the reference, so that the torque is at its limit."""
     bench = make_bench(machine=machine, controller=controller)
     for name, value in {"degraded_running": 1, "winding_current_A": 70, "switch_current_A": 70}.items():
         bench.drive.parameters[name] = value

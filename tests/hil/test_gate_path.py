@@ -1,4 +1,4 @@
-"""What opens the switches without the firmware: comparators, safe torque off, compare values that are not renewed."""
+"""Openings of the switches without the firmware: comparators, safe torque off, compare values that are not renewed."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def nothing_kept(monkeypatch, tmp_path):
 
 
 def supply_V(path: Path) -> float:
-    """Of an MF4 file, the DC link's voltage that it has last."""
+    """Last voltage of the DC link in an MF4 file."""
     with asammdf.MDF(path) as file:
         group, index = next(iter(sorted(file.whereis("bus_voltage_V"))))
         return float(file.get(group=group, index=index).samples[-1])

@@ -51,7 +51,7 @@ def similar_file(name: str, a: int, v: int, folder: Path) -> Path:
 
 
 def frames_of_a_load_step(make_bench, machine: str, controller: str, load_Nm: float) -> list[tuple[int, int, bytes]]:
-    """What the drive sends but for its identity, the hash of its database, while it starts and takes a load step."""
+    """Frames of the drive but for its identity, the hash of its database, while it starts and takes a load step."""
     bench = make_bench(machine=machine, controller=controller, seed=3)
     bench.drive.speed_reference_rpm = 600
     bench.at(0.12).load_torque_Nm = load_Nm
@@ -94,7 +94,7 @@ def test_machine_at_the_end_of_the_range_starts_and_holds_speed_under_load(make_
     steady = bench.truth["speed_rpm"].between(bench.time_s - 0.1, bench.time_s).value
     within = 0.001 if controller == "salient" else 0.03  # traditional and paper: ripple of the torque
     assert (1.0 - within) * speed_rpm < steady.min() <= steady.max() < (1.0 + within) * speed_rpm
-    # What the drive sends, in its own units, is the truth.
+    # Values that the drive sends, in its own units, is the truth.
     for signal, true, tolerance in (("speed_rpm", "speed_rpm", within * speed_rpm),
                                     ("load_torque_estimate_Nm", "load_torque_Nm", 0.15 * load_Nm)):
         assert bench.telemetry[signal].last == pytest.approx(bench.truth[true].last, abs=tolerance), signal

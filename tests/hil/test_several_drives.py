@@ -83,7 +83,7 @@ def test_commands_and_arming_of_one_node_do_not_move_another(bench):
 
 
 def test_frames_of_one_node_with_the_identifiers_of_another_are_refused(bench):
-    """What a gateway that rewrites identifiers would do: the data IDs differ."""
+    """A gateway that rewrites identifiers: the data IDs differ."""
     other = drive_database(node=1)
     bench.drives[0].off()
     bench.run_for(0.05)

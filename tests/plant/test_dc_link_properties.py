@@ -109,7 +109,7 @@ def run_reference(case: Case, supplies_V: list[float]) -> np.ndarray:
 
 
 def deviation(case: Case, measured: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Of speed, angle, DC-link voltage and currents."""
+    """Deviation of speed, angle, DC-link voltage and currents."""
     magnitude = np.max(np.abs(expected), axis=0)
     magnitude[1] = magnitude[0] * PERIODS * case.run.period_ns * 1e-9
     magnitude[0] = np.ptp(expected[:, 0])

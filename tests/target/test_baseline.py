@@ -36,9 +36,9 @@ FLASH_TOLERANCE_BYTES = 64
 RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
 BOUND_LIMITS = {"traditional": 730, "paper": 1260, "salient": 2080, "salient_four_phases": 2500}
-"""Of the control interrupt on the Cortex-M4."""
+"""Instructions of the control interrupt on the Cortex-M4."""
 BOTH_BOUND_LIMITS = {"salient": 2950, "salient_four_phases": 3350}
-"""Of both interrupts together."""
+"""Instructions of both interrupts together."""
 
 measure_once = lru_cache(measure)
 

@@ -96,7 +96,7 @@ def _toml(value: object) -> str:
 
 @dataclass(frozen=True)
 class Case:
-    """What a kind of contradiction may use."""
+    """Facts that a kind of contradiction may use."""
 
     text: Text
     machine: Machine
@@ -128,7 +128,7 @@ Kind = Callable[[Case], Keys | None]
 
 _FLUX = ("magnetics.file|magnetics.flux_linkage_max_Wb|magnetics.aligned_inductance_H|drive.torque_peak_Nm|"
          "drive.torque_rated_Nm|drive.current_peak_A")
-"""What the torque and the currents of a machine follow from."""
+"""Sources of the torque and the currents of a machine."""
 _SUPPLY = "converter.supply_voltage_V|drive.supply_max_V|drive.supply_min_V"
 _PEAK = f"drive.current_peak_A|{_FLUX}"
 

@@ -87,7 +87,7 @@ def make_clone(root: Path, commit: str, folder: Path) -> None:
 
 
 def environment() -> dict[str, str]:
-    """That of this process without what would lead a clone to another's files."""
+    """Environment of this process without all that would lead a clone to another's files."""
     return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "SALIENT_"))}
 
 

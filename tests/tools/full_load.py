@@ -85,7 +85,7 @@ class FullBus:
 
 
 def digest_of(time_ns: int, message: can.Message, before: int) -> int:
-    """Of a frame and those before it."""
+    """Digest of a frame and those before it."""
     return zlib.crc32(b"%d %d %s" % (time_ns, message.arbitration_id, message.data), before)
 
 

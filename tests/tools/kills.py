@@ -111,7 +111,7 @@ WRITES_THE_TREE = ("fault_table",)
 
 
 def line_of(kind: Kind, folder: Path) -> list[str]:
-    """What is started."""
+    """A command that is started."""
     rest = [word.format(folder=folder, root=ROOT) for word in kind.line.split()]
     if kind.module != "salient" or not (BUILD / "venv" / "bin" / "python").exists():
         return [sys.executable, "-m", kind.module, *rest]
@@ -121,7 +121,7 @@ def line_of(kind: Kind, folder: Path) -> list[str]:
 # --- what is left ---------------------------------------------------------------------------------------------------
 
 def left_of(mark: str, temporary: Path, folder: Path) -> list[str]:
-    """What a run with a mark in its environment has left: processes, temporary files, sockets and locks."""
+    """Remains of a run with a mark in its environment: processes, temporary files, sockets and locks."""
     left = [path.parent for path in Path("/proc").glob("[0-9]*/cmdline") if _belongs(path, mark, temporary)]
     found = [f"process {_read(path / 'cmdline').decode(errors='replace')[:200]!r}" for path in left]
     # pytest keeps the folders of its last three sessions.

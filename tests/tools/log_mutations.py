@@ -45,7 +45,7 @@ Timed = tuple[int, list[object]]
 
 
 def content(message: can.Message) -> list[object]:
-    """What a frame is, without time and channel."""
+    """Content of a frame, without time and channel."""
     return [getattr(message, name) for name in ORDER]
 
 

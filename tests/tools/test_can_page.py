@@ -59,7 +59,7 @@ def number_or_name(text: str) -> float | str:
 
 
 def layouts(page: str) -> dict[str, Layout]:
-    """What the tables with a column `identifier` and `bytes` describe."""
+    """Layouts that the tables with a column `identifier` and `bytes` describe."""
     found = {}
     for head, *rows in tables(page):
         if head[1:2] != ["identifier"] or "bytes" not in head:

@@ -75,7 +75,7 @@ def test_frame_reaches_the_other_client_unchanged(connect, frame):
 
 def test_own_frames_are_received_only_if_enabled(connect):
     silent, curious = connect(), connect(receive_own_messages=True)
-    # Of different identifiers: two nodes that transmit the same bits at once transmit one frame.
+    # Different identifiers: two nodes that transmit the same bits at once transmit one frame.
     for bus, identifier in ((silent, 0x123), (curious, 0x124)):
         bus.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=b"\1"))
     connect.bench.run_for(0.001)

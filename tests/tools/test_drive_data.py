@@ -112,7 +112,7 @@ def test_reaching_law_is_as_steep_as_a_short_start_needs_and_never_more_than_the
 
 
 def rise_A(machine: Machine, data: DriveData) -> float:
-    """Of the current in a control period by the largest voltage at the unaligned position."""
+    """Rise of the current in a control period by the largest voltage at the unaligned position."""
     return data.supply_max_V / machine.magnetics.unaligned_inductance_H / data.control_rate_hz
 
 

@@ -43,7 +43,7 @@ class Installed:
 
 
 def environment_of(constraints: Path) -> dict[str, str]:
-    """What a stranger has, the versions of the lock file, and pip's own settings."""
+    """Variables of a stranger, the versions of the lock file, and pip's own settings."""
     settings = {name: value for name, value in os.environ.items() if name.startswith("PIP_C")}
     return {"HOME": str(constraints.parent), "LANG": "C.UTF-8", "PIP_NO_COMPILE": "1", **settings,
             "PIP_CONSTRAINT": str(constraints)}

@@ -30,7 +30,7 @@ ORDER = ("arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame"
 
 
 def content(message: can.Message) -> list[object]:
-    """What a frame is, without time and channel."""
+    """Content of a frame, without time and channel."""
     return [getattr(message, name) for name in ORDER]
 
 

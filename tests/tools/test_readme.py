@@ -1,10 +1,10 @@
 """Documented commands work as written.
 
-In docs/, every README.md and CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and in
-the root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it would
-in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the tests
-themselves. Commands that select tests of this suite list them only: the suite runs them. Buses get a path in the test's
-folder, so that tests can run in parallel.
+In docs/, every README.md and CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and
+in the root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it
+would in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the
+tests themselves. Commands that select tests of this suite list them only: the suite runs them. Buses get a path in the
+test's folder, so that tests can run in parallel.
 """
 
 from __future__ import annotations

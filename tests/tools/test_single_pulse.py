@@ -27,7 +27,7 @@ FILES = [*sorted(MACHINES.glob("*.toml")), *sorted((ROOT / "tools" / "examples" 
 COMPARED = ("finite_element", "servo86")
 STEP_DEG = 0.5
 BEGIN_DEG = np.array([180.0, 360.0])
-"""Of the halves: motoring, braking."""
+"""Start of the halves: motoring, braking."""
 CURRENT_OVER = 1.03
 
 
@@ -35,7 +35,7 @@ CURRENT_OVER = 1.03
 
 @dataclass(frozen=True)
 class Result:
-    """Of pulses."""
+    """Result of pulses."""
 
     mean_Nm: np.ndarray
     least_Nm: np.ndarray
@@ -117,7 +117,7 @@ def pulses(name: str) -> SinglePulse:
 
 
 def speeds(name: str) -> np.ndarray:
-    """Of the points, rad/s."""
+    """Speeds of the points, rad/s."""
     return pulses(name).speed_per_voltage * simulation(name).machine.supply_voltage_V
 
 

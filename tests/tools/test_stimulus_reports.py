@@ -215,7 +215,7 @@ def test_a_frame_of_unknown_content_ends_no_report():
 
 
 def green_pixels(path: Path) -> int:
-    """Of the colour that only marks of stimuli have, which a thin line mixes with white."""
+    """Pixels in the colour that only marks of stimuli have, which a thin line mixes with white."""
     red, green, blue = np.moveaxis(imread(path)[:, :, :3], 2, 0)
     return int(np.count_nonzero((green > red + 0.15) & (green > blue + 0.03)))
 

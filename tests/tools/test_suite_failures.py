@@ -1,4 +1,4 @@
-"""What failed tests of somebody else's suite leave, and the command that runs them again."""
+"""Remains of failed tests in somebody else's suite, and the command that runs them again."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def properties(suite: Path) -> dict[str, dict[str, str]]:
-    """Of the failed cases of the report."""
+    """Properties of the failed cases of the report."""
     cases = ElementTree.parse(suite / "report.xml").getroot().iter("testcase")
     return {case.get("name"): {p.get("name"): p.get("value") for p in case.iter("property")} for case in cases
             if case.find("failure") is not None or case.find("error") is not None}

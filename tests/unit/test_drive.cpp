@@ -1235,7 +1235,7 @@ TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
 
 TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_changed_in_run) {
     periods(100);
-    // Armed for a run by commands that are none to run.
+    // Armed for a run by commands other than run.
     send(COMMAND_OFF);
     hal.to_drive.push_back(frames::arm(1, ARMING_STEP_REQUEST_RUN));
     periods(10);

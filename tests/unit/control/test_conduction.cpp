@@ -255,7 +255,7 @@ struct model_t {
 
     double least() const { return (braking ? 2.0 : 8.0) / 360.0; }
 
-    // Of the window: a pulse may be narrower than a stroke, and then its share falls over 8 degrees around its end.
+    // In the window a pulse may be narrower than a stroke, and then its share falls over 8 degrees around its end.
     bool narrow() const { return partial > 0.0 && leave - enter - 1.0 / PHASES < least(); }
     double overlap() const { return narrow() ? least() : std::max(leave - enter - 1.0 / PHASES, 2.0 / 360.0); }
     double stroke() const { return narrow() ? leave - enter - least() / 2.0 : 1.0 / PHASES; }

@@ -216,7 +216,7 @@ TEST(LoadObserver, acceleration_is_that_of_the_torque_on_the_inertia_rounded_tow
     EXPECT_EQ(load_observer_acceleration(-1, 65), 0);
 }
 
-// What the observer estimates and what its model does, for the same encoder readings and torques.
+// Estimate of the observer and motion of its model, for the same encoder readings and torques.
 struct differences_t {
     double speed_rad_s = 0.0, load_Nm = 0.0, angle_rad = 0.0;
 };

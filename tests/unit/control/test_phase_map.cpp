@@ -224,7 +224,7 @@ TEST(PhaseMap, torque_and_flux_equal_the_tables_within_three_lsb) {
 
 TEST(PhaseMap, torque_and_flux_are_exact_at_every_node_of_the_tables) {
     for (int row = 0; row < MACHINE_ROWS; row++) {
-        // Of the last row: 0, aligned, which counts as 1 LSB before.
+        // Angle of the last row: 0, aligned, which counts as 1 LSB before.
         const uint32_t angle = HALF_REV_Q32 + machine_tables.row[row].start;
         for (int32_t column = 0; column + 1 < MACHINE_COLUMNS; column++) {
             const int32_t current_q9 = column_q9(column);

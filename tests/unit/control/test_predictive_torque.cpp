@@ -110,7 +110,7 @@ class Machine {
     }
 
     // One period at a speed in electrical revolutions per period and a torque reference: duties of firmware and model.
-    // Those of the firmware act on the machine one period later.
+    // The firmware's act on the machine one period later.
     void step(double speed_rev, double reference_Nm) {
         int32_t current_q9[HAL_PHASES_MAX] = {}, flux_units[HAL_PHASES_MAX] = {};
         reference_model::predictive_t<tables_t>::sample_t seen{};
@@ -243,7 +243,7 @@ class Machine {
         return false;
     }
 
-    // Of the last period's plan, for the sample after the next one.
+    // Cell of the last period's plan, for the sample after the next one.
     const phase_cell_t &planned_cell(unsigned phase) const { return control.cell[control.turn ^ 1u][phase]; }
 
   private:

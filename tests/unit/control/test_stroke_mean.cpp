@@ -157,7 +157,7 @@ double shown_share(const std::function<bool(unsigned stroke)> &disturbed,
 TEST(StrokeMean, after_a_disturbance_the_mean_shows_the_load_from_the_end_of_an_undisturbed_stroke_on) {
     const auto constant = [](unsigned) { return 8.0; };
     EXPECT_EQ(shown_share([](unsigned) { return false; }, constant), 1.0);
-    // Of eight strokes, from 40 % of the first to the end of the second not.
+    // In eight strokes from 40 % of the first to the end of the second not.
     EXPECT_NEAR(shown_share([](unsigned stroke) { return stroke % 8 == 0; }, constant), 1.0 - 1.6 / 8.0, 0.01);
 }
 

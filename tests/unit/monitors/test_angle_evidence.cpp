@@ -44,7 +44,7 @@ class AngleEvidence : public testing::Test {
         monitor_step();
     }
 
-    // What the evidence of samples adds up to. frozen: until the encoder counts; angle: until the run ends.
+    // Sum of the evidence of samples. frozen: until the encoder counts; angle: until the run ends.
     struct Monitor {
         bool frozen, angle;
         uint32_t period;
@@ -273,7 +273,7 @@ TEST_F(AngleEvidence, a_phase_has_company_while_another_has_contradicted_the_ang
 }
 
 TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
-    // Of the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
+    // By the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.
     for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{0.05, true}}) {
         monitor = {};

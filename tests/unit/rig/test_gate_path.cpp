@@ -1,4 +1,4 @@
-// What opens the switches without the firmware (rig/board.h).
+// Causes that open the switches without the firmware (rig/board.h).
 #include <gtest/gtest.h>
 
 #include "support/emulator_machines.h"

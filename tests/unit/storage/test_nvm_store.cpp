@@ -149,7 +149,7 @@ TEST_F(NvmStore, every_bit_of_the_newest_set_that_flips_makes_the_drive_use_the_
     write(WRITE_SET);
     write(WRITE_SET);
     ASSERT_TRUE(has_set(&drive, 2));
-    // Of the commit word a flipped bit has no consequence: the checksum is that of a complete set.
+    // In the commit word a flipped bit has no consequence: the checksum is that of a complete set.
     for (unsigned word = 0; word + 1 < SET_WORDS; word++) {
         for (unsigned bit = 0; bit < 64; bit++) {
             *set_word(1, word) ^= UINT64_C(1) << bit;
@@ -329,7 +329,7 @@ TEST_F(NvmStore, a_set_whose_commit_word_is_torn_is_loaded_and_stored_once_more_
     EXPECT_NE(drive.store.saving, NVM_STORE_SAVING) << "the commit word of this one is whole";
 }
 
-// What a power cut at the present instant leaves.
+// Memory after a power cut at the present instant.
 bool starts_with_set(const memory_t &memory, uint32_t set) {
     static memory_t copy;
     started_t drive;

@@ -361,7 +361,7 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
-    """What --set and --machine name is checked by salient.experiments.sweep."""
+    """Names of --set and --machine are checked by salient.experiments.sweep."""
     parser.add_argument("scenario", type=Path, metavar="NAME|SCENARIO.toml",
                         help="bundled scenario or scenario file, for one machine of the sweep; on other machines its "
                         "speeds and loads are in terms of their base speed and rated torque")

@@ -50,7 +50,7 @@ class Rotation:
 
     @staticmethod
     def parse(text: str) -> Rotation:
-        """Of 100MB or 10min; ValueError names what is allowed."""
+        """Reads 100MB or 10min; ValueError names what is allowed."""
         match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?) ?([a-zA-Z]+)", text, re.ASCII)
         units = {unit.lower(): unit for unit in ROTATION_UNITS}
         unit = units.get(match[2].lower()) if match else None

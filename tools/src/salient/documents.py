@@ -28,8 +28,8 @@ def run(out: Path, *, generate: bool = False) -> int:
     if generate:
         write_reference()
     make_folder(out)
-    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--config-file",
-                           CONFIGURATION, "--site-dir", out.resolve()], cwd=ROOT, stdin=subprocess.DEVNULL,
+    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", CONFIGURATION,
+                           "--site-dir", out.resolve()], cwd=ROOT, stdin=subprocess.DEVNULL,
                           capture_output=True, text=True)
     if done.returncode != 0:
         raise RunFailed(f"the site has warnings:\n{(done.stdout + done.stderr).strip()}")

@@ -2,7 +2,7 @@
 exceptions by name, each with its reason, are in tools/spelling/language.toml.
 
 - A comment, a row of a table and an item of a list do not begin with "Of" or "What".
-- "none" is no predicate ("is none", "are none"), except after "there".
+- "none" follows "is" and "are" only after "there".
 - "that of" and "those of" do not open a comment, and are not written in documents: the noun is said.
 - A sentence of a document has at most 30 words.
 """

@@ -30,7 +30,7 @@ def _build_folder() -> Path:
 
 
 BUILD = _build_folder()
-"""What is made while the tools are used, and in a repository the programs: build/ in the repository, or the folder that
+"""Files made while the tools are used, and in a repository the programs: build/ in the repository, or the folder that
 SALIENT_BUILD names, for a repository that cannot be written. Nothing else reads that variable."""
 OUT = Path("out") if BUILD == ROOT / "build" or IS_WHEEL else BUILD / "out"
 """Parent of the folders of --out that are not given: in the present folder, or where everything else goes."""

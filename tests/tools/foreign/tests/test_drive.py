@@ -1,4 +1,4 @@
-"""What every drive here must do. Without --salient-program: the one that comes with the package."""
+"""Duties of every drive here. Without --salient-program: the one that comes with the package."""
 
 import pytest
 

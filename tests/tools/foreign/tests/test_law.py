@@ -1,4 +1,4 @@
-"""What the speed law of this repository is for."""
+"""Purpose of this repository's speed law."""
 
 import pytest
 

@@ -16,7 +16,7 @@ from salient.config import BenchConfig
 from salient.machine.lowest_speed import lowest_speed_rpm
 
 TELEMETRY_PERIOD_MS = 1
-"""Of a bench, unless its configuration states one; a bus with one drive alone has room for it."""
+"""Telemetry of a bench, unless its configuration states one; a bus with one drive alone has room for it."""
 
 
 class Bench(Session):

@@ -20,7 +20,7 @@ class Client(Protocol):
     drive_database: Database
     """The DBC of the drive, with the identifiers of its node number."""
     rig_database: Database
-    """That of its test bench."""
+    """Database of its test bench."""
 
     @property
     def time_ns(self) -> int:

@@ -1,4 +1,4 @@
-"""What a failed test leaves of a bench: what it did, CAN log, plots, true state of the last second, what changed, seed
+"""Report of a failed test's bench: what it did, CAN log, plots, true state of the last second, what changed, seed
 and replay command."""
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from salient.dbc import PHASES
 from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
-"""Of a plot and of the list of changes, around their moment."""
+"""Length of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00")
 """Those of the live page (view/page/palette.js)."""
@@ -28,7 +28,7 @@ TRUTH = "truth.npy"
 LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
 """The files of a folder."""
 RECORD_STEP_NS = 50_000
-"""Of the recording that a bench of a test makes for this purpose, which takes a few percent of its time."""
+"""Step of the recording that a bench of a test makes for this purpose, which takes a few percent of its time."""
 _RECORDING_HEADER_BYTES = 1024
 """RECORDER_HEADER_BYTES of emulator/plant/recorder.h."""
 _TIME_TO_ACT_S = 1e-6
@@ -41,7 +41,7 @@ _STIMULUS_COLOUR = "#009e73"
 
 @dataclass(frozen=True)
 class Saved:
-    """What a report says of a bench. last: the stimulus before the failure; stimuli: all of them, in order; changes:
+    """Report on a bench. last: the stimulus before the failure; stimuli: all of them, in order; changes:
     what changed just before."""
 
     last: str
@@ -120,7 +120,7 @@ def first_fault(session: Session) -> tuple[float, str] | None:
 
 
 def changes(session: Session, time_s: float, acts: Sequence[Stimulus] = ()) -> list[str]:
-    """What changed around a moment, in order: signals with named values of drive and test bench, the load, and what
+    """Changes around a moment, in order: signals with named values of drive and test bench, the load, and what
     was done. The torque reference in torque mode only: in speed mode the speed controller changes it all
     the time."""
     from_s, to_s = time_s - BEFORE_S, time_s + AFTER_S
@@ -152,7 +152,7 @@ def _in_torque_mode(session: Session, time_s: float) -> bool:
 
 def plot_moment(session: Session, time_s: float, title: str, path: Path,
                 acts: Sequence[Stimulus], before_s: float = BEFORE_S) -> None:
-    """What was done, speed, torque and phase currents, true and in the telemetry, and the drive's state, around a
+    """Stimuli, speed, torque and phase currents, true and in the telemetry, and the drive's state, around a
     moment."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -45,7 +45,7 @@ from salient.paths import COMMAND
 from salient.tab.link import link_of
 
 _AXES = {"machine": "machine", "controller": "controller", "target": "build"}
-"""What tests are parametrised by: keyword of bench_each -> option of a bench."""
+"""Parameters of tests: keyword of bench_each -> option of a bench."""
 _OF_THE_BENCH = frozenset(("rig", "rigs", "truth", "at", "fault", "clear_fault", "load_torque_Nm", "held_speed_rpm",
                            "simulator", "options"))
 """Attributes of `bench` that a drive without its test bench has not."""
@@ -56,7 +56,7 @@ _CHANGES_SHOWN, _STIMULI_SHOWN = 8, 40
 
 @dataclass
 class _State:
-    """Of a test. folder: what its first failure has left; saved: the benches with their folders there."""
+    """State of a test. folder: what its first failure has left; saved: the benches with their folders there."""
 
     benches: list[Session] = field(default_factory=list)
     recordings: dict[int, Path] = field(default_factory=dict)
@@ -146,7 +146,7 @@ def _starts_emulator(item: pytest.Item) -> bool:
 
 
 def _needs_bench(item: pytest.Item) -> str:
-    """What a test uses that only a test bench has, as far as its code shows; "" for nothing."""
+    """Name that a test uses and only a test bench has, as far as its code shows; "" for nothing."""
     if not isinstance(item, pytest.Function) or "make_bench" not in item.fixturenames:
         return ""
     options = {name for mark in item.iter_markers("bench_options") for name in mark.kwargs} - _OF_ANY_DRIVE

@@ -37,7 +37,7 @@ _REFERENCES = {"DRIVE_COMMAND": ("speed", "speed_reference_rpm"),
 _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
 _SILENT_PERIODS = 3
-"""Of the commands, after which they have ceased."""
+"""Periods of the commands, after which they have ceased."""
 
 
 @dataclass(slots=True)

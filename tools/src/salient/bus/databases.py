@@ -18,7 +18,7 @@ from salient.errors import UsageError, shown
 OPTION = "--dbc"
 _REASON_MAX = 160  # characters of what the parser says
 _BITS_MAX = 64
-"""Of a signal that is decoded."""
+"""Length of a signal that is decoded."""
 
 
 def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]:

@@ -1,4 +1,4 @@
-"""What logs of decoded signals have in common: the frames that wait, and the machine that decodes them."""
+"""Common parts of logs of decoded signals: the frames that wait, and the machine that decodes them."""
 
 from __future__ import annotations
 

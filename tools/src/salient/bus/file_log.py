@@ -1,4 +1,4 @@
-"""What all logs that are being written have in common."""
+"""Common parts of all logs that are being written."""
 
 from __future__ import annotations
 

@@ -248,7 +248,7 @@ class SalientBus(can.BusABC):
         return False
 
     def _end(self, timeout: float | None) -> can.CanOperationError:
-        """What recv raises when nothing is left to receive."""
+        """Error of recv when nothing is left to receive."""
         if self._has_ended or self._is_shutdown:
             time.sleep(_REPEAT_S if timeout is None else max(0.0, timeout))
         else:

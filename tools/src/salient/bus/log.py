@@ -23,7 +23,7 @@ _MS_NS = 1_000_000
 _ASC_START = "Thu Jan 1 00:00:00.000 1970"
 """Virtual time has no date."""
 _BLF_START_OFFSET = 40
-"""Of the start in the header of a file."""
+"""Offset of the start in the header of a file."""
 _NUMBER_DIGITS = 4  # of a file of a rotated log
 DECODED_SUFFIXES = (".mf4", ".csv", ".parquet")
 
@@ -32,7 +32,7 @@ class _BlfWriter(BLFWriter):
     """The writer of python-can with times in whole nanoseconds: as floats, those since 1970 lose 256 ns."""
 
     time_ns = 0
-    """Of the next frame, from the start."""
+    """Time of the next frame, from the start."""
 
     def _add_object(self, obj_type: int, data: bytes, timestamp: float | None = None) -> None:
         header_size = blf.OBJ_HEADER_BASE_STRUCT.size + blf.OBJ_HEADER_V1_STRUCT.size

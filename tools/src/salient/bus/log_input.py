@@ -52,7 +52,7 @@ class LogInput:
         self._file.close()
 
     def read(self, size: int) -> bytes:
-        """As many bytes, fewer at the end of the file. Damage: what is compressed ends early or is none."""
+        """As many bytes, fewer at the end of the file. Damage: the compressed data end early or are not compressed."""
         data = self._file.read(size) if not self.is_compressed else self._decompressed(size)
         self.position += len(data)
         return data
@@ -121,7 +121,7 @@ class LogInput:
 
     @property
     def left_out(self) -> str:
-        """What was left out, for a message; empty when nothing was."""
+        """Parts left out, for a message; empty when nothing was."""
         if self._left_out < 2:
             return self._first_left_out and f"left out: {self._first_left_out}"
         return f"left out: {self._first_left_out}, and {self._left_out - 1} more"

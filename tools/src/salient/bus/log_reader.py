@@ -119,7 +119,7 @@ def convert(source: Path, target: Path, machine: str | None, node: int = 0, rota
 def read_log(path: Path, option: str = "--convert") -> Iterator[tuple[int, can.Message]]:
     """Time in ns and frame, in the order of the file.
 
-    UsageError: the suffix or the file is none that can be read, or no frame is before its damage; LogDamaged, after the
+    UsageError: the suffix or the file cannot be read, or no frame is before its damage; LogDamaged, after the
     frames that can be read: the rest cannot be, or something that is no frame was left out. Both begin with the option.
     The work is bounded by the size of the file, the memory by a constant.
     """
@@ -156,7 +156,7 @@ def _frames(file: LogInput, path: Path, suffix: str) -> Frames:
 
 
 def _check(time_ns: int, message: can.Message, count: int) -> None:
-    """Damage: a frame is none that a bus can have, or its time none of some centuries. count: frames before."""
+    """Damage: no bus can have a frame, or its time is centuries off. count: frames before."""
     length = len(message.data)
     longest = 64 if message.is_fd else 8
     if message.arbitration_id > (0x1FFFFFFF if message.is_extended_id or message.is_error_frame else 0x7FF):

@@ -85,5 +85,5 @@ class Mf4Log(DecodedLog):
 
 
 def _selection(signal: Signal) -> tuple[str, list[int]]:
-    """What decides whether a frame carries a signal: multiplexer and its values."""
+    """Condition under which a frame carries a signal: multiplexer and its values."""
     return signal.multiplexer_signal or "", signal.multiplexer_ids or []

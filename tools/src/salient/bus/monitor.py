@@ -138,7 +138,7 @@ def _tell_events(traffic: Traffic) -> None:
 
 
 class _Lines:
-    """What a monitor prints: signals, and the traffic of the bus where that is wanted."""
+    """Output of a monitor: signals, and the traffic of the bus where that is wanted."""
 
     def __init__(self, options: argparse.Namespace, others: Sequence[Database]) -> None:
         """UsageError: no signal of a name."""

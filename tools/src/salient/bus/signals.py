@@ -257,7 +257,7 @@ class BusSignals(SignalTable):
 
 
 def frame_key(message: Message) -> FrameKey:
-    """What tells the frames of a message of a database: identifier, and whether it is extended."""
+    """Key of the frames of a message of a database: identifier, and whether it is extended."""
     return message.frame_id, message.is_extended_frame
 
 

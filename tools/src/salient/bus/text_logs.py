@@ -2,7 +2,7 @@
 
 The readers of python-can lose what these keep: times below a microsecond since 1970 and negative ones, ASC without data
 bytes or with length codes above 8, error frames and version 1.2 of TRC; and they take a line that is cut off for a
-shorter frame. A line that should be a frame and is none raises Damage; other events of a format are passed over.
+shorter frame. A line that should be a frame and is not raises Damage; other events of a format are passed over.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ _FLEXIBLE_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 
 
 class _Asc:
-    """What the lines of an ASC file mean, from those before."""
+    """Meaning of the lines of an ASC file, from those before."""
 
     def __init__(self) -> None:
         self.radix, self.is_relative, self.is_open = 16, False, False
@@ -221,7 +221,7 @@ class _Asc:
         brs, esi, code = words[at] == "1", words[at + 1] == "1", int(words[at + 2], self.radix)
         length = int(words[at + 3])
         if words[at] not in ("0", "1") or words[at + 1] not in ("0", "1") or not 0 <= length <= 64 or code > 15:
-            raise ValueError("its flags or its length are none of ASC")
+            raise ValueError("its flags or its length are not of ASC")
         data = self._data(words[at + 4 :], length)
         flags = words[at + 4 + length :][2:3]
         is_fd = not flags or bool(int(flags[0], 16) & 0x1000) or length > 8  # some writers leave the flags at 0
@@ -271,7 +271,7 @@ class _Trc:
             if value in _TRC_COLUMNS:
                 self.columns = list(_TRC_COLUMNS[value])
             elif not value.startswith("2."):
-                raise ValueError(f"version {value[:_SHOWN]!r} is none of TRC that is known")
+                raise ValueError(f"version {value[:_SHOWN]!r} is not known of TRC")
         elif name == ";$STARTTIME":
             self.start_ns = round(nanoseconds(str((Decimal(value) - _TRC_EPOCH_DAYS) * 86400)), -3)  # as its digits are
         elif name == ";$COLUMNS":
@@ -291,7 +291,7 @@ class _Trc:
             return self._first(kind, fields["I"], length, rest, time_ns)
         if kind not in ("DT", "RR", "ER", *_TRC_FLEXIBLE):
             if kind not in ("ST", "EC", "EV"):
-                raise ValueError(f"type {kind[:_SHOWN]!r} is none of TRC")
+                raise ValueError(f"type {kind[:_SHOWN]!r} is not of TRC")
             return None
         if kind == "ER":
             return time_ns, can.Message(is_error_frame=True, is_extended_id=False)
@@ -312,7 +312,7 @@ class _Trc:
         if kind.lower() == "warng" or identifier == "FFFFFFFF":
             return None  # the state of the bus
         if kind not in ("Rx", "Tx"):
-            raise ValueError(f"type {kind[:_SHOWN]!r} is none of TRC")
+            raise ValueError(f"type {kind[:_SHOWN]!r} is not of TRC")
         is_remote = rest[:1] == ["RTR"]
         return time_ns, can.Message(
             arbitration_id=int(identifier, 16), is_extended_id=len(identifier) > 4, is_remote_frame=is_remote,
@@ -387,7 +387,7 @@ def _read_busmaster(lines: Iterator[Line], file: LogInput) -> Frames:
 
 
 def _read_csv(lines: Iterator[Line], file: LogInput) -> Frames:
-    """Of SavvyCAN, with times in us, and of python-can, with data in base 64."""
+    """Frames by SavvyCAN, with times in us, and of python-can, with data in base 64."""
     header = next(lines)
     names = [name.strip().lower() for name in header.text.split(",")]
     read = next((reader for columns, reader in ((_SAVVY_COLUMNS, _savvy), (_PYTHON_CAN_COLUMNS, _python_can))

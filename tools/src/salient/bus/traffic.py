@@ -23,7 +23,7 @@ _UNKNOWN_MAX = 4096
 """Identifiers that no database defines, of which each is counted; of the further ones only all together."""
 _EVENTS_MAX = 1000
 _SLOT_NS = 100_000_000
-"""Of the greatest load."""
+"""Slot of the greatest load."""
 _BACK_NS = 1_000_000_000
 """A time that is earlier by more is another recording, or the drive has restarted."""
 _STEADY = 4
@@ -53,7 +53,7 @@ class Definition:
 
 @dataclass(frozen=True)
 class Event:
-    """What has begun or ended at a time."""
+    """Beginning or end at a time."""
 
     time_ns: int
     text: str
@@ -299,7 +299,7 @@ class Traffic:
         self.now_ns = time_ns
 
     def take_events(self) -> list[Event]:
-        """What has begun or ended since the last call, at most the latest 1000."""
+        """Events since the last call, at most the latest 1000."""
         events = list(self._events)
         self._events.clear()
         return events
@@ -307,11 +307,11 @@ class Traffic:
     # --- reports ---------------------------------------------------------------------------------------------------
 
     def report(self) -> Report:
-        """Of the time since the last report; a message without a frame in it has the cycle of all."""
+        """Report on the time since the last report; a message without a frame in it has the cycle of all."""
         return self._report(is_total=False)
 
     def total(self) -> Report:
-        """Of all time."""
+        """Report on all time."""
         return self._report(is_total=True)
 
     def _report(self, is_total: bool) -> Report:

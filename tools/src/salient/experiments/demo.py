@@ -83,7 +83,7 @@ class _Run:
     experiment: str
     scenario: Scenario
     window_s: tuple[float, float]
-    """Of the ripple and the losses."""
+    """Window of the ripple and the losses."""
     metrics: Metrics
     losses: dict[str, Any]
     log_paths: tuple[Path, Path]

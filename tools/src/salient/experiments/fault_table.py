@@ -1,4 +1,4 @@
-"""What the drive does about the faults of the test bench, measured: fault x controller x machine.
+"""Reactions of the drive to the faults of the test bench, measured: fault x controller x machine.
 
     python -m salient.experiments.fault_table [--jobs N]
 
@@ -53,7 +53,7 @@ class FaultCase:
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a drive did. fault: its first cause, "none" when it runs on. detected_s: from the start of the fault, or of
+    """A reaction. fault: the first cause, "none" when it runs on. detected_s: from the start of the fault, or of
     the run when that is later, to the first cause, None without one. peak: largest true phase current after that begin,
     of the trip. travel_deg: largest rotation of the shaft from it to the first cause."""
 

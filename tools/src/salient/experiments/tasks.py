@@ -91,7 +91,7 @@ def check_build(present: str, wanted: str) -> None:
 
 def read_results(out: Path) -> dict[str, Any]:
     """The results in a folder, of all shards, by key. The end of a line that was being written is left out. UsageError:
-    a line is none."""
+    a line has none."""
     results = {}
     for path in sorted(out.glob("runs*.jsonl")):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), start=1):

@@ -159,7 +159,7 @@ def _source(messages: list[Message], prefix: str, dbc_name: str, cycle_ms: int) 
         layouts.append(f"    {{offsetof({prefix}_telemetry_t, {name}), {len(signals)}u, {len(members)}u}},")
         for signal in members:
             low, high = raw_range(signal)
-            # Of an unsigned value no bits need to be cut off.
+            # An unsigned value has no bits that need to be cut off.
             bits = signal.length if signal.is_signed else 32
             row = f"    {{{low}, {high & 0xFFFFFFFF}u, {bits}u, {str(signal.is_signed).lower()}}},"
             index = ranges.setdefault(row, len(ranges))

@@ -24,7 +24,7 @@ FALL_MAX = 0.01
 INDUCTANCE_RATIO_MAX = 150.0
 """Aligned to unaligned. Leakage keeps built machines between 3 and 40; a unit is wrong by 1000."""
 PEAK_CURRENT_A = (0.2, 5000.0)
-"""Of a machine whose peak current follows from its saturation."""
+"""Range for a machine whose peak current follows from its saturation."""
 DROP_MAX = 0.9
 """Part of the supply in winding and devices: the base speed is derived with a tenth left."""
 RISE_MAX = 2.0
@@ -38,13 +38,13 @@ CURRENT_RANGE_MAX, VOLTAGE_RANGE_MAX = 32.0, 16.0
 NOISE_MAX = 0.03
 """Standard deviation of a current, in current limits: 0.02 are no fault, with 0.06 a healthy phase is a phase_open."""
 FLUX_DENSITY_T = (0.05, 3.0)
-"""Of saturated poles; steel saturates at 1.5 to 2.4 T, ferrite at 0.4."""
+"""Range for saturated poles; steel saturates at 1.5 to 2.4 T, ferrite at 0.4."""
 TIME_CONSTANT_MAX = 2.0
 """The drive's time constant of the winding, in those of the winding's heat path."""
 AMBIENT_C, LIMITED_BELOW_K = 25.0, 20.0
 """As AMBIENT_C of emulator/rig/heat.c; the torque is limited from LIMITED_BELOW_K below a limit of temperature on."""
 FIELDS_MAX = 30.0
-"""Of a phase at the current limit, aligned, in what the capacitor takes between supply and over-voltage."""
+"""Field of a phase at the current limit, aligned, in what the capacitor takes between supply and over-voltage."""
 _RAD_S = math.pi / 30.0
 
 Value = Callable[[Facts], float]
@@ -67,7 +67,7 @@ class Rule:
     when: Callable[[Facts], bool] = lambda of: True
 
     def names(self, of: Facts) -> tuple[str, str]:
-        """Of the two values; a key or a name of the drive's data."""
+        """Names of the two values; a key or a name of the drive's data."""
         key, other = (name if isinstance(name, str) else name(of) for name in (self.key, self.other))
         return key, other
 
@@ -154,7 +154,7 @@ def _mean_Nm(name: str) -> Value:
 
 
 def _drops_V(of: Facts) -> dict[str, float]:
-    """What is lost of the supply at the current for the rated torque, by the key that it is in proportion to."""
+    """Loss of the supply at the current for the rated torque, by the key that it is in proportion to."""
     current_A = of["current_rated_A"]
     return {"winding.resistance_ohm": of["winding.resistance_ohm"] * current_A,
             "converter.switch_drop_V": 2.0 * of["converter.switch_drop_V"],
@@ -167,7 +167,7 @@ def _largest_drop(of: Facts) -> str:
 
 
 def _drop_bound(of: Facts) -> float:
-    """Of the key of the largest drop; the others are as they are."""
+    """Bound of the key of the largest drop; the others are as they are."""
     drops_V, key = _drops_V(of), _largest_drop(of)
     return of[key] * (1.0 - (sum(drops_V.values()) - DROP_MAX * of["supply_min_V"]) / drops_V[key])
 
@@ -218,7 +218,7 @@ def _heated_K_W(current: str, limit: str, resistance_ohm: Value) -> Value:
 
 
 def _switch_ohm(of: Facts) -> float:
-    """Of the two switches of a phase at their continuous current."""
+    """Resistance of the two switches of a phase at their continuous current."""
     return 2.0 * (of["converter.switch_drop_V"] / of["switch_current_A"] + of["converter.switch_resistance_ohm"])
 
 

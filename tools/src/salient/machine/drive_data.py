@@ -36,7 +36,7 @@ SMOOTH_SHARE = 0.8
 """Part of the torque of the tables that is left when currents rise and fall with finite voltage."""
 PEAK_OF_RATED = 1.2
 TORQUE_MIN_NM = 1e-4
-"""Of magnetics that make none: they have data, too, which contradictions.py compares."""
+"""Torque of magnetics that make none: they have data, too, which contradictions.py compares."""
 CURRENT_RANGE_A = 80.0
 """Largest current of the firmware's tables, in the machine's unit of current, a power of two."""
 _CURRENT_SEARCHED_A = 10_000.0
@@ -217,9 +217,9 @@ def _current_range_A(machine: Machine, peak_A: float, rise_A: float) -> float:
 
 
 def _least_trip_A(limit_A: float, rise_A: float) -> float:
-    """What no current of a healthy machine reaches: hysteresis, which sees a current a period late and acts a period
-    later, exceeds its limit by up to 2.4 periods of rise, measured on machines of all sizes; the hundredth is the
-    sensors' error."""
+    """Value that no current of a healthy machine reaches: hysteresis, which sees a current a period late and acts a
+    period later, exceeds its limit by up to 2.4 periods of rise, measured on machines of all sizes; the hundredth is
+    the sensors' error."""
     return 1.01 * limit_A + 2.4 * rise_A
 
 

@@ -104,7 +104,7 @@ class Thermal(Table):
 
 
 class Drive(Table):
-    """What is left out is derived (drive_data.py)."""
+    """Keys left out are derived (drive_data.py)."""
 
     supply_min_V: Annotated[float, number(1.0, 2000.0)] | None = None
     supply_max_V: Annotated[float, number(1.0, 2000.0)] | None = None

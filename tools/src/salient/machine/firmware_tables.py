@@ -49,7 +49,7 @@ _ROW_CURRENTS = np.array([1.0, 0.75, 0.5, 0.25, 0.125, 0.0625])  # fractions of 
 # levelled: as noise of a map, up to FALL_MAX of the largest torque at the same current; beyond the map's largest
 # current, where its flux linkage is extrapolated linearly, by any amount.
 
-# Torque, as a fraction of the largest at the same current, that is none: what a spline through a map leaves before the
+# Torque, as a fraction of the largest at the same current, that is zero: as a spline through a map leaves before the
 # poles overlap, of any slope. A phase that is to make a torque there would turn its current off.
 _NO_TORQUE = 5e-4
 

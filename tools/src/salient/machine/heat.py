@@ -12,7 +12,7 @@ WINDING_RISE_K, INVERTER_RISE_K = 100.0, 50.0
 """Steady temperature rise at the continuous current."""
 INVERTER_TIME_CONSTANT_S = 20.0
 _LOSS_MIN = 0.001
-"""Of the switches' rating, voltage times current: ideal devices have no loss."""
+"""Part of the switches' rating, voltage times current: ideal devices have no loss."""
 
 
 def thermal_constants(machine: Machine, parameters: Mapping[str, float], supply_V: float) -> dict[str, float]:

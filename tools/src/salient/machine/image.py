@@ -1,4 +1,4 @@
-"""What a drive is made of, member by member: the C structures that a machine file fills, and the machine image, the
+"""Parts of a drive, member by member: the C structures that a machine file fills, and the machine image, the
 file from which the emulator reads them when it starts (emulator/host/machine_image.h has its layout).
 
 Each member is one line here. From it follow the C sources of programs that have a machine compiled in
@@ -119,7 +119,7 @@ def quantise(value: float, fraction_bits: int, bits: int) -> int:
 
 @dataclass(frozen=True)
 class FirmwareTables:
-    """What is sampled or computed from a machine's magnetics."""
+    """Values sampled or computed from a machine's magnetics."""
 
     phase_map: PhaseMap
     pulse: PulseTables
@@ -151,7 +151,7 @@ def _format(name: str, surface: Callable[[PhaseMap], Surface]) -> tuple[Member, 
 
 
 def _padded(values: list[int]) -> list[int]:
-    """Of every parameter, with zeros up to the size of the array."""
+    """Values of every parameter, with zeros up to the size of the array."""
     return values + [0] * (_PARAMETERS_MAX - len(values))
 
 
@@ -213,7 +213,7 @@ TABLES = Structure("machine_tables_t", (
     Member("dbc_hash", "uint32_t", lambda machine, scaling, tables: database_hash(database_of(scaling.dbc()))),
     Member("machine_hash", "uint32_t", lambda machine, scaling, tables: tables.machine_hash),
 ))  # fmt: skip
-"""Of a Machine, its Scaling and its FirmwareTables: firmware/control/machine_tables.h."""
+"""Members from a Machine, its Scaling and its FirmwareTables: firmware/control/machine_tables.h."""
 
 
 # --- the emulator's machine -----------------------------------------------------------------------------------------
@@ -254,7 +254,7 @@ PLANT = Structure("machine_t", (
         machine, scaling.data.parameters, scaling.data.supply_max_V)),
     Member("trip_current_A", "double", lambda machine, scaling: scaling.data.comparator_trip_A),
 ))  # fmt: skip
-"""Of a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""
+"""From a Machine and its Scaling: emulator/plant/machine.h, without the name and the flux map, parts of their own."""
 
 FLUX_MAP = Structure("flux_map_t", (
     Member("current_max_A", "double", lambda flux_map: flux_map.current_max_A),
@@ -263,7 +263,7 @@ FLUX_MAP = Structure("flux_map_t", (
     Member("coenergy_J", "double", lambda flux_map: flux_map.coefficients_J,
            (CURRENT_INTERVALS + 4, ANGLE_INTERVALS + 3)),
 ))  # fmt: skip
-"""Of a FluxMap: emulator/plant/flux_map.h."""
+"""Members from a FluxMap: emulator/plant/flux_map.h."""
 
 
 # --- the image ------------------------------------------------------------------------------------------------------

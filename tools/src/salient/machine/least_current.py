@@ -41,7 +41,7 @@ def least_current_deg(magnetics: Any, phases: int, torque_Nm: float, limit_A: fl
     row = np.arange(len(angle_deg))[:, None]
     current_A = share_A[row, low] + (place - low) * (share_A[row, low + 1] - share_A[row, low])
     cost = (current_A**2).sum(axis=0)
-    # Of several of the same width the one that costs least.
+    # Among several of the same width the one that costs least.
     permitted = cost <= (1.0 + more) * cost.min()
     best = int(np.where(permitted, overlap_deg - 1e-3 * cost / cost.min(), -1.0).argmax())
     return np.array([on_deg[best], on_deg[best] + stroke_deg + overlap_deg[best]])

@@ -23,7 +23,7 @@ from salient.machine.sharing_window import SharingWindow
 from salient.machine.single_pulse import LANE_DEG, STEP_DEG, TURN, Pairs, Phase, SinglePulse, parabola, vertex
 
 PARTS = (0.25, 0.5, 0.75)
-"""Of the largest mean torque, as MACHINE_PULSE_PARTS."""
+"""Parts of the largest mean torque, as MACHINE_PULSE_PARTS."""
 
 _MORE_CURRENT = 1.08
 _BOTH_WAYS = [
@@ -39,11 +39,11 @@ the pulse of the largest torque; way from there to the pulse of the least curren
 _CURRENT_WEIGHT = 2.0
 """Ripple, relatively, that a relative current is worth."""
 _EARLIER_COST = 0.05
-"""Of a window that is earlier, motoring: where nothing else is better."""
+"""Cost of a window that is earlier, motoring: where nothing else is better."""
 _LOWER_WEIGHT = 2.0
-"""Of a reference that has to be lower than the torque, because the fall of the current adds to it."""
+"""Weight of a reference that has to be lower than the torque, because the fall of the current adds to it."""
 _LOWERED_LEAST = 0.06
-"""Of the largest mean torque: less is within the error of these steps, and the firmware trims it."""
+"""Part of the largest mean torque: less is within the error of these steps, and the firmware trims it."""
 _FAR_DEG = 100.0
 """Sum of both angles between neighbours in the tables that is worth as much as a ripple of 1; half of it a quarter."""
 _REFUSED = 1e3
@@ -59,7 +59,7 @@ _ROUNDS = 3
 """Until the mean torque is the wanted one within _TORQUE_ERROR."""
 _TORQUE_ERROR = 0.02
 _SLOPES = (0.5, 3.0)
-"""Of the logarithm of the mean torque over that of the reference."""
+"""Slopes of the logarithm of the mean torque over that of the reference."""
 _HIGHER_MAX = 2.0
 """Factor by which a reference may have to be higher for it."""
 _BEYOND = 1e3
@@ -95,13 +95,13 @@ class _Operation:
     """By lane."""
 
     mean_Nm: np.ndarray
-    """Of all phases."""
+    """Mean of all phases."""
     peak_Nm: np.ndarray
     ripple: np.ndarray
-    """Of the torque, relatively."""
+    """Ripple of the torque, relatively."""
     rms_A: np.ndarray
     flux_Wb: np.ndarray
-    """Of each phase, to go on with."""
+    """Flux linkage of each phase, to go on with."""
 
 
 def partial_pulse(machine: Machine, data: DriveData, of: SinglePulse, window: SharingWindow) -> PartialPulse:
@@ -218,10 +218,10 @@ class _Follower:
 
     def operations(self, wanted_Nm: np.ndarray, pulse_deg: np.ndarray, largest_deg: np.ndarray,
                    sharing_deg: np.ndarray) -> _Choices:
-        """Of each lane, those that make the wanted torque: the pulse last."""
+        """Choices of each lane that make the wanted torque: the pulse last."""
         pulse = self.run(pulse_deg, _BEYOND * wanted_Nm)
         crest = np.maximum(pulse.peak_Nm / wanted_Nm, 1.0)
-        # Of a slightly different torque.
+        # At a slightly different torque.
         least_A = pulse.rms_A * np.sqrt(wanted_Nm / pulse.mean_Nm)
         earlier_deg, to_largest, to_pulse = _WAYS[self.half].T[..., None]
         angles_deg = sharing_deg[:, None] - earlier_deg
@@ -281,7 +281,7 @@ class _Follower:
                                np.minimum(most_Wb, np.maximum(phase.flux_Wb(index, share * reference_Nm), least_Wb)),
                                most_Wb)
             _, torque_Nm = phase.state(index, np.maximum(held_Wb, 0.0))
-            # What is missing is left to the phase that entered first.
+            # The rest is left to the phase that entered first.
             missing_Nm = np.maximum(reference_Nm - self.sign * torque_Nm.sum(axis=0), 0.0)
             inside = (past_deg > 0) & (on > 0.0)
             oldest = inside & (past_deg == np.where(inside, past_deg, -1000).max(axis=0))

@@ -55,7 +55,7 @@ _COMMAND, _COMMAND_SIGNAL = "DRIVE_COMMAND", "speed_reference_rpm"
 
 @dataclass(frozen=True)
 class Exponents:
-    """Of two, of the units of a machine's formats; 0: SI."""
+    """Powers of two, for the units of a machine's formats; 0: SI."""
 
     current: int = 0
     voltage: int = 0
@@ -63,7 +63,7 @@ class Exponents:
     speed: int = 0
 
     def of_unit(self, unit: str) -> int:
-        """Of an SI unit (r/min with a speed): 0 for one that no exponent changes."""
+        """Exponent of an SI unit (r/min with a speed): 0 for one that no exponent changes."""
         return {
             "A": self.current,
             "V": self.voltage,
@@ -81,12 +81,12 @@ class Exponents:
         }.get(unit, 0)
 
     def of_parameter(self, row: ParameterDefinition) -> int:
-        """Of a parameter's unit. Per angle as per speed and second: an integral of the speed is in its units."""
+        """For a parameter's unit. Per angle as per speed and second: an integral of the speed is in its units."""
         unit = {"speed_ki": "N m/rad", "smc_delta": "s/rad"}.get(row.name, row.unit)
         return self.of_unit(unit)
 
     def fraction_bits(self, row: ParameterDefinition) -> int:
-        """Of a parameter's raw value in its SI unit; negative: the LSB is a power of two above one."""
+        """Bits of a parameter's raw value in its SI unit; negative: the LSB is a power of two above one."""
         return row.fraction_bits - self.of_parameter(row)
 
     def raw(self, row: ParameterDefinition, value: float) -> int:
@@ -107,7 +107,7 @@ class Scaling:
         return [self.exponents.raw(row, self.data.parameters[row.name]) for row in read_table()]
 
     def fraction_bits(self) -> list[int]:
-        """Of every parameter, by index."""
+        """Bits of every parameter, by index."""
         return [self.exponents.fraction_bits(row) for row in read_table()]
 
     def sensor_ranges(self) -> dict[str, float]:

@@ -104,7 +104,7 @@ def _earlier_deg(phases: _Phases, braking: bool, speed_rad_s: float, at_rest_deg
     made = phases.run(braking, speed_rad_s, tried_deg[part, which], parts_Nm[part])
     ripple = np.maximum((made.largest_Nm - made.least_Nm) / parts_Nm[part] - _RIPPLE_FREE, 0.0)
     least_A2 = np.array([made.square_A2[part == of].min() for of in range(len(parts_Nm))])
-    # Of windows with little torque the current is small.
+    # In windows with little torque the current is small.
     missed = np.maximum(1.0 - made.least_Nm / parts_Nm[part], 0.0)
     cost = (made.square_A2 / least_A2[part] + _RIPPLE_WEIGHT * (ripple + missed)
             + _EARLIER_WEIGHT * earlier_deg[which].sum(axis=1) - _WIDTH_WEIGHT * width_deg[part, which])

@@ -44,7 +44,7 @@ _LATER_ON_DEG = 60
 _MOTORING_OFF_MAX_DEG = 353.0
 _SMOOTH_OFF_DEG = np.append(np.arange(240.0, 353.0, 8.0), 358.0)
 _FINE_DEG = 0.25
-"""Of the braking envelope."""
+"""Step of the braking envelope."""
 _FLUX_POINTS = 48
 _CURRENT_TOP = 1.2
 """Largest current of the tables, as a multiple of the limit."""
@@ -55,7 +55,7 @@ _REST_DEG = 2.0
 _CURRENT_WEIGHT = 0.05
 """Relative torque that a relative square of the RMS current is worth."""
 _VOLTAGE_SHARE_MAX = 0.95
-"""Of the voltage that the resistance may take, and of the supply that the switches may: a current that is not reached
+"""Share of voltage that the resistance may take, and of the supply that the switches may: a current that is not reached
 is no limit."""
 
 
@@ -131,14 +131,14 @@ class _Sweep:
     torque: np.ndarray
     """Integral over the angle, N m times steps."""
     square: np.ndarray
-    """Of the square of the current, A^2 times steps."""
+    """Sum of the square of the current, A^2 times steps."""
     over: np.ndarray
     """Largest flux linkage, as a fraction of that of _CURRENT_OVER times the current limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Of turn-on and turn-off angles; arrays by turn-off, speed and turn-on."""
+    """Pairs of turn-on and turn-off angles; arrays by turn-off, speed and turn-on."""
 
     on_deg: np.ndarray
     off_deg: np.ndarray
@@ -335,7 +335,7 @@ class Phase:
 
 
 def _row(index: Any) -> Any:
-    """Of the tables of a turn, by the angle in steps."""
+    """Row of the tables of a turn, by the angle in steps."""
     return (index - 180 // STEP_DEG) % TURN
 
 
@@ -347,7 +347,7 @@ def _whole(half: np.ndarray) -> np.ndarray:
 # --- search ---------------------------------------------------------------------------------------------------------
 
 def _pairs(rise: _Sweep, fall: _Sweep, sign: float, on_deg: np.ndarray, off_deg: np.ndarray) -> Pairs:
-    """Of a rise and the fall that meets it."""
+    """Pairs of a rise and the fall that meets it."""
     below = (fall.flux_Wb[..., None, :] <= rise.flux_Wb[..., None]).sum(axis=-1) - 1
     below = np.clip(below, 0, fall.flux_Wb.shape[-1] - 2)
 

@@ -1,4 +1,4 @@
-"""What a machine's magnetics and a voltage can make: smooth torque of a current, time of a change of speed. The mean
+"""Abilities of a machine's magnetics and a voltage: smooth torque of a current, time of a change of speed. The mean
 torque over the speed: single_pulse.py."""
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _BISECTIONS = 24  # to 1e-7 of the range
 
 @dataclass(frozen=True)
 class Source:
-    """What a phase is connected to."""
+    """Connection of a phase."""
 
     voltage_V: float
     resistance_ohm: float
-    """Of winding and devices."""
+    """Resistance of winding and devices."""
 
 
 def smooth_torque_Nm(magnetics: Any, phases: int, current_A: float) -> float:

@@ -1,4 +1,4 @@
-"""What no commutation of a machine exceeds: the largest mean torque over the speed, and the least RMS current of a mean
+"""Bounds of any commutation: the largest mean torque over the speed, and the least RMS current of a mean
 torque, of one pulse of voltage in each electrical revolution.
 
 A phase gets the voltage of the DC link from a turn-on to a turn-off angle and the opposite one after it, through the
@@ -43,9 +43,9 @@ _LINK_EXPONENT = 20
 """By which the search values the torque of a pair less whose DC link is above its limit: it ends at that limit."""
 _CYCLES_MAX = 36
 _PERIODIC = 1e-4
-"""Of the flux linkage's limit: change from a revolution to the next at which it counts as periodic."""
+"""Tolerance of the flux linkage's limit: change from a revolution to the next at which it counts as periodic."""
 _LINK_PERIODIC = 1e-3
-"""Of the supply's voltage: change of the DC link's, likewise."""
+"""Tolerance of the supply's voltage: change of the DC link's, likewise."""
 _CHOPPER_STEP = 0.25
 """Part of the way to the voltage at which the chopper takes what the last revolution returned."""
 _OVER_FULL = 1.1
@@ -59,13 +59,13 @@ _SAME_TORQUE = 0.01
 
 @dataclass(frozen=True)
 class Limits:
-    """What the drive permits."""
+    """Limits of the drive."""
 
     current_A: float
     over_voltage_V: float
-    """Of the DC link, at which the drive trips; has an effect with a table [dc_link] only."""
+    """Voltage of the DC link, at which the drive trips; has an effect with a table [dc_link] only."""
     supply_V: float
-    """Of the source, at no load."""
+    """Voltage of the source, at no load."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Pulse:
     torque_Nm: float
     """Mean over a revolution; negative when braking, 0 when no pair of angles is permitted."""
     rms_A: float
-    """Of the current of a phase."""
+    """Value of the current of a phase."""
     peak_A: float
     link_W: float
     """Mean power from the DC link, negative when it is returned."""
@@ -238,7 +238,7 @@ class _Run:
 
 
 _SUMS = ("work_J", "square_A2", "device_J", "link_J", "peak_A", "link_mean_V", "link_highest_V")
-"""Of a revolution: work on the shaft, mean square of the current, losses of the devices, energy from the link."""
+"""Sums of a revolution: work on the shaft, mean square of the current, losses of the devices, energy from the link."""
 
 
 class _Revolution:
@@ -257,7 +257,7 @@ class _Revolution:
         self._drawn_A = np.zeros_like(self.link_V)
 
     def of(self, which: np.ndarray) -> _Revolution:
-        """Those of some of the pairs."""
+        """Values of some of the pairs."""
         part = copy.copy(self)
         part._on, part._step_s = self._on[:, which], self._step_s[which]
         part.link_V, part._drawn_A = self.link_V[:, which], self._drawn_A[:, which]

@@ -1,4 +1,4 @@
-"""What the page of a tab has beside its scripts: module, machines, databases; packed by salient.tab.file, read by
+"""Data that the page of a tab has beside its scripts: module, machines, databases; packed by salient.tab.file, read by
 page/data.js."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from salient.view.description import description
 
 _MACHINE_DEPENDENT = ("factor", "offset", "minimum", "maximum")
 _FLUX_DIGITS = 5
-"""Of the picture of the machine."""
+"""Digits in the picture of the machine."""
 
 
 def bundled_machines() -> list[str]:

@@ -33,7 +33,7 @@ COMMANDS: dict[str, dict[str, type]] = {
     "fault_trace": {},
     "fault_log": {},
 }
-"""Those of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
+"""Commands of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
 _OPTIONAL: dict[str, dict[str, type]] = {
     "fault": {"phase": str, "leg": str, "value": object, "duration_s": float},
     "end_fault": {"phase": str, "leg": str},
@@ -45,7 +45,7 @@ class Malformed(Exception):
 
 
 def check_command(name: Any, arguments: Any) -> None:
-    """Malformed when the name or the arguments are none of a command."""
+    """Malformed when no command has the name or the arguments."""
     if not isinstance(name, str) or name not in COMMANDS or not isinstance(arguments, dict):
         raise Malformed
     required, optional = COMMANDS[name], _OPTIONAL.get(name, {})

@@ -1,4 +1,4 @@
-"""What a page has to know of a drive, as JSON: Info of page/source.js."""
+"""Description of a drive for a page, as JSON: Info of page/source.js."""
 
 from __future__ import annotations
 

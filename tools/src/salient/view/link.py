@@ -62,7 +62,7 @@ class Link:
         self.time_ns = 0
         self.ended = False
         self.shown_ns: int | None = None
-        """What the commanding page has shown; None without one."""
+        """State shown by the commanding page; None without one."""
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
         self.telemetry: SignalTable = LatestSignals(self.drive_database, "DRIVE")
         self.truth: SignalTable = LatestSignals(self.rig_database, "RIG")
@@ -215,7 +215,7 @@ class Link:
             self.shown_ns = min(self.shown_ns, time_ns)
 
     def take_shown(self, shown_ns: int) -> None:
-        """What the commanding page has shown; it may be of the time before the drive restarted."""
+        """State shown by the commanding page; it may be of the time before the drive restarted."""
         self.shown_ns = min(shown_ns, self.time_ns)
 
     def _send_due(self) -> None:

@@ -92,7 +92,7 @@ class Server:
 
     @property
     def link(self) -> str:
-        """What the user opens."""
+        """Address that the user opens."""
         return f"http://127.0.0.1:{self._port}/?token={self.token}"
 
     def run(self) -> None:

@@ -29,7 +29,7 @@ class VmError(Exception):
 
 @dataclass(frozen=True)
 class VmFiles:
-    """What QEMU boots from. `modules` are in the order in which they must be loaded."""
+    """Files that QEMU boots from. `modules` are in the order in which they must be loaded."""
 
     kernel: Path
     modules: tuple[Path, ...]

@@ -1,1 +1,1 @@
-"""What each estimator and correction of the controller `salient` contributes: runs without it."""
+"""Contribution of each estimator and correction of the controller `salient`: runs without it."""

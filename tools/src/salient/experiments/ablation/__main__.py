@@ -65,7 +65,7 @@ class Variant:
     program: Path | None = None
 
     def key(self) -> str:
-        """What its runs depend on, other than the case."""
+        """Dependencies of its runs, other than the case."""
         of_bug = (self.bug.file, self.bug.old, self.bug.new) if self.bug else ()
         files = (Path(measure.__file__), self.program or executable())
         return " ".join([*map(tasks.file_digest, files), repr(of_bug)])

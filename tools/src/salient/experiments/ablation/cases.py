@@ -37,7 +37,7 @@ LOADS = ("step", "sine", "ramps", "turn")
 LOAD_WEIGHTS = (0.4, 0.2, 0.25, 0.15)
 PROFILES = ("compressor_one_cylinder", "compressor_two_cylinders")
 PROFILE_MAX_NM = 200.0
-"""Of the rig's load_profile_Nm."""
+"""Largest of the rig's load_profile_Nm."""
 COARSE_BITS, SLOW_PART = 12, 0.02
 LONG_S = 2.0
 RAMPS_END_S = 0.15
@@ -112,7 +112,7 @@ def _imperfections(draw: np.random.Generator, poles: int) -> tuple[dict[str, flo
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What is varied on purpose."""
+    """Quantities varied on purpose."""
 
     rpm: float
     bits: int

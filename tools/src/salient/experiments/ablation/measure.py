@@ -1,4 +1,4 @@
-"""What the runs of the ablation are measured by."""
+"""Measures of the ablation's runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BAND_OF_BASE = 0.002
 """A start ends within this part of the reference, and of the base speed."""
 
 MEASURES = {"ripple": 0.005, "dip": 0.001, "swing": 0.0001, "mean error": 0.00002, "start": 0.002}
-"""What is measured, and what is added to both values of a ratio: changes below that do not matter. The ripple is K_t;
+"""Measures, and the value added to both values of a ratio: changes below that do not matter. The ripple is K_t;
 dip, swing and error of the mean speed are parts of the base speed; the start is in seconds."""
 
 Values = dict[str, float]

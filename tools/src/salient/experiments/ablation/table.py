@@ -37,7 +37,7 @@ NOTHING = Cost(1.0, 1.0)
 
 
 def logarithms(without: Results, reference: Results, numbers: Sequence[int], measure: str) -> np.ndarray:
-    """Of the ratios of a measure, over the runs that have it in both."""
+    """Logarithms of the ratios of a measure, over the runs that have it in both."""
     floor = MEASURES[measure]
     ratios = []
     for number in numbers:
@@ -48,7 +48,7 @@ def logarithms(without: Results, reference: Results, numbers: Sequence[int], mea
 
 
 def cost(ratios: np.ndarray) -> Cost:
-    """Of logarithms of ratios."""
+    """Cost by the logarithms of ratios."""
     if ratios.size == 0:
         return NOTHING
     worst = np.sort(ratios)[-math.ceil(ratios.size / 10):]
@@ -56,7 +56,7 @@ def cost(ratios: np.ndarray) -> Cost:
 
 
 def scatter(seeds: Sequence[Results], numbers: Sequence[int], measure: str) -> Cost:
-    """That of the same drive with other seeds: the largest of all pairs; the mean at least its standard error."""
+    """Scatter of the same drive with other seeds: the largest of all pairs; the mean at least its standard error."""
     mean = worst = 0.0
     for one in range(len(seeds)):
         for other in range(len(seeds)):
@@ -70,7 +70,7 @@ def scatter(seeds: Sequence[Results], numbers: Sequence[int], measure: str) -> C
 
 @dataclass(frozen=True)
 class Row:
-    """What the removal of a mechanism costs. own: by measure, in the parts that it was made for, and the scatter there;
+    """Cost of the removal of a mechanism. own: by measure, in the parts that it was made for, and the scatter there;
     most: the part and measure whose mean is the furthest beyond its scatter; changed, failed: numbers of runs."""
 
     name: str
@@ -121,7 +121,7 @@ def _failures(results: Results, numbers: Sequence[int]) -> int:
 
 
 def head() -> str:
-    """Of the table, in Markdown."""
+    """Head of the table, in Markdown."""
     return (f"| without | made for | runs that change | {' | '.join(MEASURES)} | failures | most in | needed by |\n"
             f"|{' --- |' * (len(MEASURES) + 6)}\n")
 

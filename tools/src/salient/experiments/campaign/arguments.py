@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def parser(module: str, text: str | None) -> argparse.ArgumentParser:
-    """Of a module, with DIR for its results as first argument; text: of the module, its help."""
+    """Parser of a module, with DIR for its results as first argument; text: of the module, its help."""
     made = argparse.ArgumentParser(f"python -m salient.experiments.campaign.{module}", description=text,
                                    formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     made.add_argument("out", type=Path, metavar="DIR", help="folder for the results; what it has is not run again")

@@ -38,11 +38,11 @@ def pool_file() -> Path:
 
 
 TORQUE_COMMAND_FRACTION_BITS = 16
-"""Of DRIVE_TORQUE_COMMAND.torque_reference_Nm, where the unit is 1 N m."""
+"""Bits of DRIVE_TORQUE_COMMAND.torque_reference_Nm, where the unit is 1 N m."""
 CURRENT_FRACTION_BITS = 9
-"""Of currents in telemetry, where the unit is 1 A."""
+"""Bits of currents in telemetry, where the unit is 1 A."""
 VOLTAGE_FRACTION_BITS = 6
-"""Of voltages in telemetry, where the unit is 1 V."""
+"""Bits of voltages in telemetry, where the unit is 1 V."""
 
 
 def pool_line(path: Path) -> str:

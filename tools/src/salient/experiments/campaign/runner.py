@@ -42,14 +42,14 @@ def program() -> Path:
 
 @lru_cache
 def digest() -> str:
-    """Of all that a result depends on but the seed: the program and the machines."""
+    """Digest of all that a result depends on but the seed: the program and the machines."""
     images = [line.split()[0] for line in pool_file().read_text(encoding="utf-8").splitlines()]
     parts = [program().read_bytes(), *(Path(image).read_bytes() for image in images)]
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
 
 
 def commit() -> str:
-    """That of the sources, with a plus when they differ from it."""
+    """Commit of the sources, with a plus when they differ from it."""
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
         return done.stdout.strip() if done.returncode == 0 else ""
@@ -72,7 +72,7 @@ def _lines(options: Sequence[object], programs: Programs | None = None) -> list[
 
 
 def world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False) -> Result:
-    """What a seed stands for: machine, board, events."""
+    """World of a seed: machine, board, events."""
     return _lines(["--first", seed, "--keep", kept, "--describe", *_mode(healthy)])[0]
 
 

@@ -25,7 +25,7 @@ SUMMARY = "summary.json"
 
 
 def hashes(task: tuple[int, str]) -> dict[str, Any]:
-    """Of a seed, one for each run; task: seed, target. For workers."""
+    """Hashes of a seed, one for each run; task: seed, target. For workers."""
     seed, target = task
     first = str(run_world(seed).get("hash", "crash"))
     bench, on_target = replay(seed), replay(seed, build=target)

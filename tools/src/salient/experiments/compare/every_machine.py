@@ -32,7 +32,7 @@ RANDOM = BUILD / "random_machines"
 QUICK = ("fan12", "servo86")
 
 START_PART, LOADED_PART, LOAD_PART = 0.4, 0.25, 0.5
-"""Of base speed and rated torque."""
+"""Parts of base speed and rated torque."""
 BOUND_FACTOR, BOUND_EXTRA_S = 1.1, 0.002
 """A change of speed is in time within this factor of its bound, or the bound and this time."""
 RIPPLE_MAX, RIPPLE_OF_REFERENCE = 0.010, 1.2
@@ -164,7 +164,7 @@ def change_bound_s(path: str, from_rpm: float, to_rpm: float) -> float:
 
 
 def failures(values: Metrics, controller: str) -> list[str]:
-    """What a drive of any machine must do and this one does not."""
+    """Duties of a drive of any machine that this one fails."""
     late_s, hold_percent = values["late_s"], values["hold_percent"]
     wrong = [f"{name} not settled" for name in ("start", "brake", "reverse")
              if controller == "salient" and values[f"{name}_to_bound"] is None]

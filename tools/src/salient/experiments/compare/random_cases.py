@@ -73,7 +73,7 @@ def random_load(number: int) -> Scenario:
 
 
 def _load_max_Nm(machine: str, speed_rpm: float, friction_gain: float) -> float:
-    """What friction leaves of nine tenths of the drive's torque limit; at five times the nominal one and 1500 r/min it
+    """Rest after friction of nine tenths of the drive's torque limit; at five times the nominal one and 1500 r/min it
     takes most of it."""
     friction_Nm_s = machine_of(machine).friction_Nm_s * friction_gain
     return max(1.0, 0.9 * TORQUE_MAX_NM - friction_Nm_s * speed_rpm * math.pi / 30.0)

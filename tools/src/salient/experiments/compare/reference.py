@@ -16,7 +16,7 @@ DRIVES = ("firmware", "reference")
 
 
 def measure(machine: str, **conditions: float) -> dict[str, dict[str, float]]:
-    """Of both drives ripple, torque_mean_Nm and speed_mean_rpm of one run under a constant load. conditions: the
+    """Both drives' ripple, torque_mean_Nm and speed_mean_rpm of one run under a constant load. conditions: the
     program's arguments."""
     image: Path = machine_image(machine)
     arguments = [f"{name}={float(value)!r}" for name, value in conditions.items()]

@@ -64,7 +64,7 @@ def run_all(cases: Sequence[Case], jobs: int | None, stream: TextIO, out: Path, 
 
 
 def _key(case: Case, image: Path) -> str:
-    """What the result of a run depends on: its description, the programs, the image of its machine, the code of the
+    """Dependencies of the result of a run: its description, the programs, the image of its machine, the code of the
     metrics and its load profile."""
     profile = case.scenario.load_profile
     metrics = [Path(str(module.__file__)) for module in _METRICS_MODULES]
@@ -75,7 +75,7 @@ def _key(case: Case, image: Path) -> str:
 
 
 def _programs_digest(case: Case) -> str:
-    """Of the programs that the run of a case executes."""
+    """Digest of the programs that the run of a case executes."""
     files = (executable(), *((reference_executable(),) if case.extractor == "every_machine" else ()))
     return hashlib.sha256(" ".join(map(tasks.file_digest, files)).encode()).hexdigest()
 
@@ -102,7 +102,7 @@ def _ratio(value: float | None, of: float | None) -> float | None:
 
 
 def _run(task: tuple[Case, str]) -> tuple[Metrics, str, Any]:
-    """Of a case, and the digest of the programs that everybody must have."""
+    """Runs a case; task: it, and the digest of the programs that everybody must have."""
     case, programs = task
     tasks.check_build(_programs_digest(case), programs)
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:

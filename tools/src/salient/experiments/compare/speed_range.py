@@ -78,7 +78,7 @@ SUPPLIES = (0.7, 0.8, 0.9, 1.1)
 
 _DYNAMOMETER_RPM_S = 10_000.0
 _REQUEST_MAX_NM = 10_000.0
-"""Of a scenario."""
+"""Limit of a scenario."""
 _SETTLED_S, _WINDOW_S = 0.1, 0.1
 _RECORD_US = 5.0
 _LONG_RECORD_US = 20.0

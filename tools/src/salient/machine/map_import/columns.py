@@ -33,7 +33,7 @@ class Column:
 
     role: str
     unit: str | None = None
-    """Of an angle: deg, rad, mdeg or mrad, with "electrical " before it where the name says so."""
+    """Unit of an angle: deg, rad, mdeg or mrad, with "electrical " before it where the name says so."""
     factor: float | None = None
     """To A, Wb or H; None where no unit is stated."""
 

@@ -49,7 +49,7 @@ CURRENTS_MIN = 6
 
 @dataclass(frozen=True)
 class Supply:
-    """What bounds currents and flux linkages without a unit."""
+    """Bounds of currents and flux linkages without a unit."""
 
     voltage_V: float
     resistance_ohm: float
@@ -73,7 +73,7 @@ class _Phase:
     flux_Wb: np.ndarray
     """By angle and current."""
     line: np.ndarray
-    """Of the file, by angle and current."""
+    """Line of the file, by angle and current."""
 
 
 def correct(points: Points, rotor_poles: int, phases: int, supply: Supply) -> Imported:
