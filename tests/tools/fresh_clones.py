@@ -41,6 +41,8 @@ SHORTER = {
     "test --only hil --only plant": [],
     "campaign --seeds 200": ["campaign --seeds 20"],
     "campaign --seeds 10000": [],
+    "compare machines": [],
+    "pil --figures": [],
     "compare robustness --resume --out out/robustness": [],
 }
 """Documented command lines that take from minutes to hours: what is run instead. CI runs the whole suite."""
