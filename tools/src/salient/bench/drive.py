@@ -425,7 +425,7 @@ class LoggedFault:
     current_max_A: float
     torque_reference_Nm: float
     currents_A: tuple[float, ...]
-    """Of phases a to f; 0 of one that the machine does not have."""
+    """Phases a to f; 0 for one that the machine does not have."""
     rotor_angle_deg: float
     self_test: tuple[str, ...]
     """Checks of DRIVE_SELF_TEST that had failed."""

@@ -23,7 +23,7 @@ BEFORE_S, AFTER_S = 0.05, 0.01
 """Length of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00")
-"""Those of the live page (view/page/palette.js)."""
+"""Colours of the live page (view/page/palette.js)."""
 TRUTH = "truth.npy"
 LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
 """The files of a folder."""

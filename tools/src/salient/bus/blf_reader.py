@@ -193,7 +193,7 @@ def _inflated(content: bytes, length: int, begin: int, is_cut: bool) -> tuple[by
 
 
 _CODE_MAX = 15
-"""Of a length, which has 4 bits on the bus and a byte in the file: more than that means no more."""
+"""Largest code of a length, which has 4 bits on the bus and a byte in the file: more than that means no more."""
 
 
 def _check_size(content: bytes, size: int) -> None:

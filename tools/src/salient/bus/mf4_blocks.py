@@ -22,7 +22,7 @@ _INFLATED_MAX = 1 << 26
 """Bytes of a compressed block; the standard has 4 MiB."""
 _PIECE = 1 << 18
 _COMPRESSED_PIECE = 1 << 12
-"""What is decompressed before an error is kept, but for a piece."""
+"""Bytes decompressed at a time: before an error all is kept but for a piece."""
 _DATA = (b"##DT", b"##SD", b"##RD", b"##DV")
 _UNFINISHED_LENGTH = 4
 """Flag of a file that is not finished: the last data block reaches to the end of the file."""

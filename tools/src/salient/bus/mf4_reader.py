@@ -56,7 +56,7 @@ class _Channel:
 
     @property
     def end(self) -> int:
-        """Of its bytes in the record."""
+        """Offset after its bytes in the record."""
         return self.byte_offset + (self.bit_offset + self.bit_count + 7) // 8
 
     def numbers(self, records: np.ndarray) -> np.ndarray:
@@ -215,7 +215,7 @@ def _conversion(blocks: Blocks, address: int) -> tuple[float, float]:
 
 
 def _check_channel(channel: _Channel, size: int) -> None:
-    """Damage: it is none that a record can have."""
+    """Damage, unless a record can have it."""
     if channel.kind == _VIRTUAL_MASTER:
         return
     bits = channel.bit_count

@@ -33,7 +33,7 @@ def load_database(path: Path) -> Database:
 
 
 _PHASES = 4
-"""Of a machine that is not known, at most."""
+"""Phases of a machine that is not known, at most."""
 
 
 @lru_cache

@@ -444,7 +444,7 @@ def _check_slope(flux_Wb: np.ndarray, current_A: np.ndarray, place: Callable[[in
 
 
 def _bend(flux_Wb: np.ndarray) -> np.ndarray:
-    """What a curve has beside the nearest one whose slope has one maximum, about its middle."""
+    """Rest of a curve beside the nearest one whose slope has one maximum, about its middle."""
     fall = -np.diff(flux_Wb)
     best: np.ndarray | None = None
     for top in range(0, len(fall) + 1, _TOP_STEP):
