@@ -13,6 +13,7 @@
 
 extern "C" {
 #include "control/machine_tables.h"
+#include "hal.h"
 #include "host/machine_image.h"
 }
 
@@ -168,7 +169,7 @@ TEST(MachineImage, sizes_and_values_that_bound_memory_are_checked) {
         });
     }
     refused("wrong size", "name without an end", [](bytes_t &bytes) { bytes.back() = 'x'; });
-    for (const uint32_t phases : {0u, 5u, 0xffffffffu}) {
+    for (const uint32_t phases : {0u, HAL_PHASES_MAX + 1u, 0xffffffffu}) {
         refused("out of range", "phases", [&](bytes_t &bytes) { put_word(bytes, plant_at + 8, phases); });
     }
     for (const uint32_t form : {machine_plant.magnetics.form == MAGNETICS_MAP ? 0u : 3u, 4u, 0xffffffffu}) {
