@@ -276,8 +276,8 @@ def test_several_faults_are_present_together_and_end_each_by_itself(bench: Bench
 
 @pytest.mark.parametrize(("kind", "arguments", "text"), [
     ("winding_opened", {}, "no fault 'winding_opened'; the nearest of .* are winding_open, [a-z_]+, [a-z_]+$"),
-    ("winding_open", {}, "winding_open: phase missing: must be a, b, c or d"),
-    ("winding_open", {"phase": "e"}, "winding_open: phase 'e': must be a, b, c or d"),
+    ("winding_open", {}, "winding_open: phase missing: must be a, b, c, d, e or f"),
+    ("winding_open", {"phase": "g"}, "winding_open: phase 'g': must be a, b, c, d, e or f"),
     ("winding_open", {"phase": "d"}, "winding_open d at 0 us: no_such_place"),
     ("winding_open", {"phase": "a", "leg": "low"}, "winding_open has no leg; it has phase"),
     ("switch_open", {"phase": "a", "leg": "top"}, "leg 'top': must be high or low"),

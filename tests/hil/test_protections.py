@@ -275,7 +275,8 @@ def test_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion
     bench.run_for(0.001)  # the snapshot follows the state in the same telemetry cycle
     assert bench.drive.fault == "over_speed"
     direction = -1 if moves.load_Nm > 0 else 1
-    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700 * direction, abs=2)
+    # The estimate rises by some r/min in a sample where the observer widens its bandwidth.
+    assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(700 * direction, abs=3)
     torque_Nm = bench.telemetry["DRIVE_FAULT_SNAPSHOT.torque_reference_Nm"].last
     assert torque_Nm == pytest.approx(-19.1 * direction, abs=0.05)
     bench.run_for(0.005)

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <cstring>
 #include <functional>
+#include <iterator>
 #include <random>
 
 #include <gtest/gtest.h>
@@ -117,7 +118,7 @@ class Control : public testing::Test {
         };
         const uint32_t currents[] = {telemetry.currents.current_a_a, telemetry.currents.current_b_a,
                                      telemetry.currents.current_c_a, telemetry.currents.current_d_a};
-        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        for (unsigned phase = 0; phase < std::size(currents); phase++) {
             values.current_q9[phase] = int32_t(currents[phase]);
         }
         return values;

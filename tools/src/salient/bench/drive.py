@@ -499,19 +499,28 @@ class FaultTrace:
     lower_duty: np.ndarray
 
 
-def read_fault_trace(session: Client) -> FaultTrace:
-    """Reads the trace from the drive, which keeps it from a fault to the next run; takes some 0.3 s of virtual time.
-    DriveError when there is none."""
-    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
-    parts = _TRACE_PARTS + (_TRACE_MORE_PARTS if phases > _TRACE_PHASES else 0)
-    raw = np.zeros((TRACE_PERIODS, 2 * parts), dtype="<i2")
+def _read_trace_parts(session: Client, parts: Sequence[int]) -> np.ndarray:
+    """A row for each period, two signed numbers of 16 bits for each part."""
+    raw = np.zeros((TRACE_PERIODS, 2 * len(parts)), dtype="<i2")
     for period in range(TRACE_PERIODS):
-        for part in range(parts):
+        for column, part in enumerate(parts):
             status, value = _access(session, "fault_trace", period, part)
             if status != "done":
                 reason = ": the drive keeps no record; it has had no fault, or has run since"
                 raise DriveError(f"fault trace: {status}{reason if status == 'no_such_entry' else ''}")
-            raw[period, 2 * part : 2 * part + 2] = np.frombuffer(value.to_bytes(4, "little", signed=True), dtype="<i2")
+            raw[period, 2 * column : 2 * column + 2] = np.frombuffer(value.to_bytes(4, "little", signed=True),
+                                                                     dtype="<i2")
+    return raw
+
+
+def read_fault_trace(session: Client) -> FaultTrace:
+    """Reads the trace from the drive, which keeps it from a fault to the next run; takes some 0.3 s of virtual time.
+    DriveError when there is none."""
+    raw = _read_trace_parts(session, range(_TRACE_PARTS))
+    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
+    if phases > _TRACE_PHASES:
+        more = _read_trace_parts(session, range(_TRACE_PARTS, _TRACE_PARTS + _TRACE_MORE_PARTS))
+        raw = np.concatenate((raw, more), axis=1)
     snapshot = session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
     scale = {signal.name: float(signal.scale) for signal in snapshot.signals}
     positive = raw.astype(np.uint16).astype(float)
