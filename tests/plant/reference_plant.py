@@ -20,10 +20,10 @@ from scipy.integrate import solve_ivp
 
 import salient.machine.file
 import salient.machine.flux_map
+from salient.dbc import PHASES_MAX
 from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
 from salient.paths import BUILD
 
-PHASES_MAX = 4
 TICK_NS = 5
 FORMS = ("linear_cosine", "linear_trapezoid", "saturating")
 MAP = 3  # MAGNETICS_MAP, after the forms
