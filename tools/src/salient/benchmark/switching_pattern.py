@@ -158,7 +158,7 @@ def program_input(pattern: SwitchingPattern, passes: int, step_factor: float = 1
     """Input of plant_benchmark_<machine> (emulator/plant_benchmark/main.c)."""
     current_A = [*pattern.current_A, *[0.0] * (PHASES_MAX - pattern.phases)]
     state = (pattern.angle_rad, pattern.speed_rad_s, pattern.load_torque_Nm, *current_A, step_factor)
-    head = struct.pack("8d4I", *state, pattern.period_ticks, pattern.periods, passes, 0)
+    head = struct.pack(f"{4 + PHASES_MAX}d4I", *state, pattern.period_ticks, pattern.periods, passes, 0)
     compares = np.zeros((pattern.periods, 2, PHASES_MAX), dtype="u2")
     compares[:, 0, : pattern.phases], compares[:, 1, : pattern.phases] = pattern.upper, pattern.lower
     return head + compares.tobytes()
