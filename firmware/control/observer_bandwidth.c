@@ -110,7 +110,7 @@ observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_band
             .threshold_count = threshold_count,
             .threshold_edge = adaptive ? THRESHOLD_EDGE : THRESHOLD_NEVER,
             .mean_innovation_gain_q32 = (int32_t)fixed_divide((int64_t)MEAN_INNOVATION_1_S << 32, rate_hz),
-            .threshold_beat = count + 3u * count / 8u,
+            .threshold_error = 3u * count / 8u,
             .beat_step_min = count / 2,
             .beat_rounding_min_q4 = 16u * count / BEAT_PARTS,
             .edge_step_min = count / (rate_hz / EDGE_RATE_MIN_HZ),
@@ -208,7 +208,7 @@ void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,
     const bool beat =
         !sample->from_edge && rounding_q4 >= schedule->beat_rounding_min_q4 && angle_step >= schedule->beat_step_min;
     const uint32_t withheld_min = frequent_edges ? LAST_STAGE - schedule->steady_stage_edge : !beat;
-    const uint32_t threshold_beat = beat ? schedule->threshold_beat : 0;
+    const uint32_t threshold_beat = beat ? rounding_q4 / 8 + schedule->threshold_error : 0;
     const uint32_t threshold_mean = threshold_of(schedule, threshold_of_mean(statistics), frequent_edges);
     limits->threshold_mean = fixed_max_u32(threshold_mean, threshold_beat);
     limits->withheld_stages = (uint8_t)fixed_max_u32(withheld_stages, withheld_min);

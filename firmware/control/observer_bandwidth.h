@@ -30,11 +30,11 @@
  *
  *   J w0^2 2 pi / 2^bits = 1/512 of the largest torque,
  *
- * between 100 rad/s and the steady one, and the threshold is 11/8 counts: the largest step of the sawtooth and 3/8
- * count. The step of the present one is not known: its q follows from an estimated speed, which is wrong after a load
- * step. Narrower still, an error of the torque's estimate moved the rotor from count to count: of an error T at any
- * frequency the angle's is at most 0.385 T / (J w0^2), at w0 / sqrt(2) (derived here). A rotor that turns by less than
- * half a count in a period has no beat: each count tells the speed.
+ * between 100 rad/s and the steady one, and the threshold is at least a step of the sawtooth, which is twice the
+ * rounding, and 3/8 count; for all q but 1 it stays 1.125 counts. Narrower still, an error of the torque's estimate
+ * moved the rotor from count to count: of an error T at any frequency the angle's is at most 0.385 T / (J w0^2), at w0
+ * / sqrt(2) (derived here). A rotor that turns by less than half a count in a period has no beat: each count tells the
+ * speed.
  *
  * With a wrong model (three times the inertia, tables half a degree off) each transient would trigger the next: a limit
  * cycle. Two measures suppress it. Each trigger lengthens the retrigger hold-off, the minimum time to the next trigger,
@@ -69,7 +69,7 @@ typedef struct {
     uint32_t threshold_count;         /* 2^-32 rev, for the middle of a count */
     uint32_t threshold_edge;          /* 2^-32 rev, for an angle from the time of an edge */
     int32_t mean_innovation_gain_q32; /* low-pass gain of the mean innovation per period, Q0.32 */
-    uint32_t threshold_beat;          /* 2^-32 rev, in a beat */
+    uint32_t threshold_error;         /* 2^-32 rev, besides the step of a beat */
     uint32_t beat_step_min;           /* rotation per period from which on there are beats, 2^-32 rev */
     uint32_t beat_rounding_min_q4;    /* rounding of a beat, 2^-32 rev, Q28.4 */
     uint32_t edge_step_min;           /* rotation per period from which edges are frequent, 2^-32 rev */
