@@ -16,6 +16,7 @@ from salient.paths import BUILD, ROOT
 
 TIMEOUT_S = 30
 EXIT_FAULT, EXIT_LAYOUT = 70, 78
+_LAYOUT = r"(#define MAILBOX_LAYOUT_OF\(phases\) \()([0-9]+)u"
 
 COMPILERS = {
     "mps2_an386": ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-nostartfiles"],
@@ -56,7 +57,7 @@ def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
     def make(layout: int) -> Path:
         mailbox = tmp_path / "qemu" / "mailbox.h"
         mailbox.parent.mkdir()
-        text, count = re.subn("(#define MAILBOX_LAYOUT) [0-9]+", rf"\1 {layout}", (hal / "qemu/mailbox.h").read_text())
+        text, count = re.subn(_LAYOUT, rf"\g<1>{layout}u", (hal / "qemu/mailbox.h").read_text())
         assert count == 1
         mailbox.write_text(text)
         drive, image = tmp_path / "drive.c", tmp_path / "image.elf"
@@ -65,7 +66,8 @@ def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
         sources = [ROOT / "emulator/qemu/image/main.c", *sorted((hal / "qemu").glob("*.c")),
                    *sorted((hal / "qemu" / request.param).glob("*.c"))]
         scripts = [hal / "qemu" / request.param / "memory.ld", hal / "qemu" / "sections.ld"]
-        command = [*COMPILERS[request.param], "-std=c11", "-O1", "-ffreestanding", *(f"-I{one}" for one in folders),
+        command = [*COMPILERS[request.param], "-std=c11", "-O1", "-ffreestanding", "-DHAL_PHASES_MAX=4",
+                   *(f"-I{one}" for one in folders),
                    *map(str, sources), str(drive), *(f"-Wl,-T,{one}" for one in scripts), "-o", str(image)]
         subprocess.run(command, check=True, timeout=TIMEOUT_S)
         return image
@@ -74,7 +76,7 @@ def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
 
 
 def layout_of_world() -> int:
-    return int(re.search("#define MAILBOX_LAYOUT ([0-9]+)", (ROOT / "hal/qemu/mailbox.h").read_text())[1])
+    return int(re.search(_LAYOUT, (ROOT / "hal/qemu/mailbox.h").read_text())[2])
 
 
 def run(image: Path, folder: Path) -> subprocess.CompletedProcess:
