@@ -3,7 +3,6 @@
 #include "comms/units.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
-#include "fixed/divide.h"
 #include "fixed/fixed.h"
 #include "interrupts/deferred.h"
 #include "interrupts/speed_control.h"
@@ -25,14 +24,15 @@ static uint32_t percent(uint32_t load_q16) {
     return (uint32_t)(((uint64_t)load_q16 * 10000u + (1u << 15)) >> 16);
 }
 
-/* Mean of the phases, mechanical, 2^-32 turn. */
+/* Mean of the phases, mechanical, 2^-32 turn, within an LSB for each phase: six offsets have a sum beyond 32 bits, whose
+ * division in software would take longer than the control interrupt, in a critical section. */
 static int32_t misalignment(const drive_t *drive) {
-    const int32_t phases = machine_tables.phases;
-    int64_t sum = 0;
+    const int32_t phases = machine_tables.phases, divisor = phases * machine_tables.rotor_poles;
+    int32_t mean = 0;
     for (int32_t phase = 0; phase < phases; phase++) {
-        sum += drive->control.deferred.misalignment.phase[phase].offset;
+        mean += drive->control.deferred.misalignment.phase[phase].offset / divisor;
     }
-    return (int32_t)fixed_divide(sum, phases * machine_tables.rotor_poles);
+    return mean;
 }
 
 uint16_t telemetry_self_test(const drive_t *drive) {
