@@ -99,7 +99,13 @@ static unsigned list_variants(variant_t variants[VARIANTS_MAX], const machine_t 
 static void begin_fault(run_t *run, const variant_t *variant) {
     const fault_kind_t *kind = &fault_kinds[variant->kind];
     const int32_t raw = kind->has_attribute ? (int32_t)floor(variant->value / kind->scale + 0.5) : 0;
-    const uint32_t bits = variant->kind | variant->phase << 7 | variant->leg << 10 | 1u << 11 | (uint32_t)raw << 12;
+    const uint32_t bits = fault_request_bits(&(fault_request_t){
+        .kind = (uint8_t)variant->kind,
+        .phase = (uint8_t)variant->phase,
+        .leg = (uint8_t)variant->leg,
+        .begins = true,
+        .raw = raw,
+    });
     const uint8_t data[8] = {(uint8_t)bits, (uint8_t)(bits >> 8), (uint8_t)(bits >> 16), (uint8_t)(bits >> 24)};
     faults_receive(&run->rig, data);
 }

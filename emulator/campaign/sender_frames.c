@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "campaign/drive_numbers.h"
+#include "fault_kinds.h"
 #include "rig_codec.h"
 
 #define SEQUENCE_STEP_MAX 8 /* of the counter: frames that a receiver may take for lost ones */
@@ -138,8 +139,13 @@ void sender_put_events(sender_t *sender, const transport_receiver_t *receiver) {
                 put_bench(sender, receiver, RIG_SET_FRAME_ID, (uint8_t)event->what,
                           (uint32_t)(end ? event->raw_end : event->raw), at_us);
             } else {
-                const uint32_t bits = event->what | event->phase << 7 | event->leg << 10 | (end ? 0u : 1u) << 11 |
-                                      (uint32_t)event->raw << 12;
+                const uint32_t bits = fault_request_bits(&(fault_request_t){
+                    .kind = (uint8_t)event->what,
+                    .phase = (uint8_t)event->phase,
+                    .leg = (uint8_t)event->leg,
+                    .begins = !end,
+                    .raw = event->raw,
+                });
                 put_bench(sender, receiver, RIG_FAULT_FRAME_ID, (uint8_t)bits, bits >> 8, at_us);
             }
         }

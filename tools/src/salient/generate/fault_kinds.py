@@ -46,13 +46,18 @@ static const fault_kind_t fault_kinds[FAULT_COUNT] = {{
 {rows}
 }};
 
-/* Fields of a {message}. */
+/* Fields of a {message}, the first four bytes of which are `fault_request_bits` in little-endian order. */
 typedef struct {{
     uint8_t kind, phase, leg;
     bool begins;
     int32_t raw; /* of the attribute */
     uint32_t at_us;
 }} fault_request_t;
+
+static inline uint32_t fault_request_bits(const fault_request_t *request) {{
+    return request->kind | (uint32_t)request->phase << 7 | (uint32_t)request->leg << 10 |
+           (uint32_t)request->begins << 11 | (uint32_t)request->raw << 12;
+}}
 
 static inline fault_request_t fault_request(const uint8_t *data) {{
     const int32_t bits = data[1] >> 4 | data[2] << 4 | data[3] << 12;
