@@ -31,13 +31,14 @@ JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memo
 
 PYTHON_LAYERS = (
     "salient", "salient.guard", "salient.errors", "salient.paths", "salient.workers", "salient.progress",
-    "salient.config", "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.c_limits",
-    "salient.turns",
+    "salient.config", "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.exceptions",
+    "salient.c_limits", "salient.language", "salient.turns",
     "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
     "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
+    "salient.documents",
     "salient.__main__",
 )  # fmt: skip
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import lizard
 
+from salient.exceptions import unexplained
 from salient.paths import ROOT
 
 FOLDERS = ("firmware", "hal", "emulator")
@@ -33,16 +33,6 @@ def excesses(root: Path = ROOT) -> Iterator[tuple[str, str]]:
                 yield name, f"complexity {function.cyclomatic_complexity}, at most {COMPLEXITY_MAX}"
 
 
-def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, str]:
-    """Names of files and functions, each with the reason why it may be beyond a limit."""
-    with path.open("rb") as file:
-        return tomllib.load(file)
-
-
 def violations(exceptions: Mapping[str, str], root: Path = ROOT) -> list[str]:
     """One line for each excess without a reason, and for each exception that is not needed any more."""
-    found = list(excesses(root))
-    lines = [f"{name}: {excess}" for name, excess in found if not exceptions.get(name, "").strip()]
-    needed = {name for name, _ in found}
-    return lines + [f"{name}: an exception of {EXCEPTIONS.name} that is not needed"
-                    for name in exceptions if name not in needed]
+    return unexplained(((name, f"{name}: {excess}") for name, excess in excesses(root)), exceptions, EXCEPTIONS)

@@ -10,10 +10,10 @@ exceptions by name, each with its reason, are in tools/spelling/language.toml.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from salient.exceptions import unexplained
 from salient.paths import ROOT
 
 EXCEPTIONS = ROOT / "tools" / "spelling" / "language.toml"
@@ -95,17 +95,8 @@ def breaches(root: Path = ROOT) -> Iterator[tuple[str, int, str]]:
             yield from ((name, number, breach) for number, breach in found)
 
 
-def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, str]:
-    """Names ("FILE: BREACH"), each with the reason why it may be."""
-    with path.open("rb") as file:
-        return tomllib.load(file)
-
-
 def violations(exceptions: Mapping[str, str], root: Path = ROOT) -> list[str]:
-    """One line for each breach without a reason, and for each exception that is not needed any more."""
-    found = list(breaches(root))
-    lines = [f"{name}:{number}: {breach}" for name, number, breach in found
-             if not exceptions.get(f"{name}: {breach}", "").strip()]
-    needed = {f"{name}: {breach}" for name, _, breach in found}
-    return lines + [f"{name}: an exception of {EXCEPTIONS.name} that is not needed"
-                    for name in exceptions if name not in needed]
+    """One line for each breach without a reason, and for each exception that is not needed any more. An exception is
+    named "FILE: BREACH"."""
+    return unexplained(((f"{name}: {breach}", f"{name}:{number}: {breach}") for name, number, breach in breaches(root)),
+                       exceptions, EXCEPTIONS)

@@ -210,17 +210,20 @@ def _within_limits() -> bool:
     """Sizes of C functions and files."""
     from salient import c_limits
 
-    lines = c_limits.violations(c_limits.read_exceptions())
-    for line in lines:
-        _print(line)
-    return not lines
+    return _all_explained(c_limits.EXCEPTIONS, c_limits.violations)
 
 
 def _keeps_the_language() -> bool:
     """Rules of comments and documents."""
     from salient import language
 
-    lines = language.violations(language.read_exceptions())
+    return _all_explained(language.EXCEPTIONS, language.violations)
+
+
+def _all_explained(exceptions: Path, violations: Callable[[Mapping[str, str]], list[str]]) -> bool:
+    from salient.exceptions import read_exceptions
+
+    lines = violations(read_exceptions(exceptions))
     for line in lines:
         _print(line)
     return not lines
