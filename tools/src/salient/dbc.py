@@ -28,7 +28,10 @@ def phases_above(message: Message) -> int:
 
 PHASES = ("a", "b", "c", "d", "e", "f")
 """Names of the phases, of which a machine has the first three to all (HAL_PHASES_MAX of the host in hal/hal.h)."""
-PHASES_MAX = len(PHASES)
+PHASES_MIN, PHASES_MAX = 3, len(PHASES)
+"""With fewer there is an angle at which no phase has a torque in the wanted direction."""
+FIRST_PHASES = 4
+"""Phases that every drive's messages, and an image for a board unless stated, have room for."""
 _PHASES_ABOVE = re.compile(r'^BA_ "PhasesAbove" BO_ (\d+) (\d+);', re.MULTILINE)
 
 

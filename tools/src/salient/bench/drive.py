@@ -19,7 +19,7 @@ from salient.bus import e2e
 from salient.bus.identity import OtherDatabase
 from salient.bus.signals import SignalTable, drive_database, signal_range, value_numbers
 from salient.config import either
-from salient.dbc import PHASES
+from salient.dbc import FIRST_PHASES, PHASES, phases_above
 from salient.errors import RunFailed, close_names
 from salient.machine.parameter_table import CHOICES, value_name
 
@@ -48,10 +48,11 @@ ORIGINS = ("defaults", "memory", "unusable")
 _FAULT_ITEMS = ("fault", "state", "checks", "start", "time_us", "time_wraps", "speed_rpm", "bus_voltage_V",
                 "current_max_A", "torque_reference_Nm", "current_a", "current_b", "current_c", "current_d", "angle",
                 "self_test", "phases", "current_e", "current_f")
-"""Parts of the operations memory and fault_log, as drive.dbc lists them."""
+_FAULT_ITEMS_OF_MORE = 2
+"""Parts of the operations memory and fault_log, as drive.dbc lists them; the last ones of a drive of more phases."""
 LOGGED_FAULTS = 16
 TRACE_PERIODS = 64
-_TRACE_PARTS, _TRACE_PHASES = 8, 4
+_TRACE_PARTS = 8
 _TRACE_MORE_PARTS = 3
 """Parts for two phases more; two phases a part."""
 _OPERATIONS = value_numbers(drive_database(), "PARAMETER_REQUEST", "operation")
@@ -433,10 +434,15 @@ class LoggedFault:
     """Letters of the phases of DRIVE_PHASE_FAULT."""
 
 
+def _has_more_phases(session: Client) -> bool:
+    """The drive's machine has more phases than FIRST_PHASES."""
+    return any(phases_above(message) > 0 for message in session.drive_database.messages)
+
+
 def _self_tests() -> dict[int, str]:
     """Names of the checks by their bits in the log: those of DRIVE_SELF_TEST, then the sensors of phases e and f."""
     signals = drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
-    more = [f"{part}_sensor_{phase}" for part in ("winding", "inverter") for phase in PHASES[4:]]
+    more = [f"{part}_sensor_{phase}" for part in ("winding", "inverter") for phase in PHASES[FIRST_PHASES:]]
     return {signal.start: signal.name for signal in signals} | dict(enumerate(more, start=len(signals)))
 
 
@@ -460,10 +466,11 @@ class FaultLog(Sequence[LoggedFault]):
         return self.read()[index]
 
     def _read(self, number: int) -> LoggedFault | None:
-        items: dict[str, int] = {}
-        for part, name in enumerate(_FAULT_ITEMS):
+        items = dict.fromkeys(_FAULT_ITEMS, 0)
+        count = len(_FAULT_ITEMS) - (0 if _has_more_phases(self._session) else _FAULT_ITEMS_OF_MORE)
+        for part, name in enumerate(_FAULT_ITEMS[:count]):
             status, items[name] = _access(self._session, "fault_log", 0, part, number)
-            if status != "done" and name not in ("current_e", "current_f"):  # those a drive of four phases has not
+            if status != "done":
                 return None
         snapshot = self._session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
         physical = {signal.name: items[signal.name] * float(signal.scale) for signal in snapshot.signals}
@@ -517,15 +524,15 @@ def read_fault_trace(session: Client) -> FaultTrace:
     """Reads the trace from the drive, which keeps it from a fault to the next run; takes some 0.3 s of virtual time.
     DriveError when there is none."""
     raw = _read_trace_parts(session, range(_TRACE_PARTS))
-    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
-    if phases > _TRACE_PHASES:
+    if _has_more_phases(session):
         more = _read_trace_parts(session, range(_TRACE_PARTS, _TRACE_PARTS + _TRACE_MORE_PARTS))
         raw = np.concatenate((raw, more), axis=1)
+    phases = int(session.telemetry["DRIVE_HEARTBEAT.phases"].last)
     snapshot = session.drive_database.get_message_by_name("DRIVE_FAULT_SNAPSHOT")
     scale = {signal.name: float(signal.scale) for signal in snapshot.signals}
     positive = raw.astype(np.uint16).astype(float)
-    columns = [[*range(first, first + _TRACE_PHASES), more, more + 1][:phases]
-               for first, more in ((0, 16), (8, 18), (8 + _TRACE_PHASES, 20))]
+    columns = [[*range(first, first + FIRST_PHASES), more, more + 1][:phases]
+               for first, more in ((0, 16), (8, 18), (8 + FIRST_PHASES, 20))]
     return FaultTrace(
         time_s=np.arange(1 - TRACE_PERIODS, 1) / session.telemetry["DRIVE_HEARTBEAT.control_rate_hz"].last,
         current_A=positive[:, columns[0]] * scale["current_max_A"],

@@ -16,14 +16,15 @@ from salient.bench.session import Session
 from salient.bench.stimulus import STIMULI, Stimulus, last_before, stimuli_of
 from salient.bus.log import write_logs
 from salient.config import BenchConfig
-from salient.dbc import PHASES
+from salient.dbc import PHASES, PHASES_MIN
 from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
 """Length of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
-COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00")
+COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#7711dd", "#996655")
 """Colours of the live page (view/page/palette.js)."""
+_OF_MORE_PHASES = tuple(f"current_{phase}_A" for phase in PHASES[PHASES_MIN:])
 TRUTH = "truth.npy"
 LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
 """The files of a folder."""
@@ -173,7 +174,7 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path,
     for axes, panel in zip(rows, panels, strict=True):
         for (source, name), colour in zip(panel, COLOURS, strict=False):
             signal = getattr(session, source)[name]
-            if name in ("current_d_A", "current_e_A", "current_f_A") and not signal.value.any():
+            if name in _OF_MORE_PHASES and not signal.value.any():
                 continue  # a machine of fewer phases
             signal = signal.between(from_s, to_s)
             axes.plot(signal.time_s, signal.value, label=f"{source} {signal.name}", color=colour,

@@ -30,10 +30,6 @@ _IMAGE_PARTS = ("drive_codec", "salient_firmware", "salient_port", "salient_main
 """Targets of CMake that images of every machine have in common."""
 
 
-_PHASES_OF_A_BUILD, _PHASES_MAX = 4, 6
-"""Phases that the images of a target build have room for, and at most (SALIENT_PHASES_MAX of CMakeLists.txt)."""
-
-
 class EmulatorError(RunFailed):
     """A program failed; the text includes its standard error."""
 
@@ -114,14 +110,16 @@ def _build_custom(path: Path, key: str, build: str, phases: int) -> Path:
     """Builds the image for a user's machine file in a folder for its path and content, one process at a time. Of the
     sources only its tables are compiled: it links the firmware of the target build, of a machine of more than four
     phases that of a build with room for six."""
+    from salient.dbc import FIRST_PHASES, PHASES_MAX  # cantools, and here only
+
     if shutil.which("cmake") is None:
         raise UsageError("cmake is missing; a machine file of your own on a target requires a build")
     _remove_orphans()
     folder = BUILD / f"machine-{hashlib.sha256(f'{path} {key}'.encode()).hexdigest()[:12]}"
     folder.mkdir(exist_ok=True)
     parts, options = BUILD / build, tuple[str, ...]()
-    if phases > _PHASES_OF_A_BUILD:
-        parts, options = BUILD / f"phases-{_PHASES_MAX}" / build, (f"-DSALIENT_PHASES_MAX={_PHASES_MAX}",)
+    if phases > FIRST_PHASES:
+        parts, options = BUILD / f"phases-{PHASES_MAX}" / build, (f"-DSALIENT_PHASES_MAX={PHASES_MAX}",)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (folder / "machine_file").write_text(str(path), encoding="utf-8")

@@ -14,7 +14,7 @@ import cantools
 import numpy as np
 from cantools.database.can import Database, Message
 
-from salient.dbc import drive_dbc_of_node, drive_dbc_of_phases, rig_dbc_of_node
+from salient.dbc import FIRST_PHASES, drive_dbc_of_node, drive_dbc_of_phases, rig_dbc_of_node
 from salient.errors import close_names
 from salient.machine.file import load_machine, machine_path
 from salient.machine.scaling import database_of, scaling_of
@@ -32,16 +32,12 @@ def load_database(path: Path) -> Database:
     return database
 
 
-_PHASES = 4
-"""Phases of a machine that is not known, at most."""
-
-
 @lru_cache
 def drive_database(machine: str | None = None, node: int = 0) -> Database:
     """The DBC of the drive of a machine, given by name or file, with its factors and ranges, without a machine that in
     SI units; and with the identifiers of a node number. MachineError."""
     if machine is None:
-        text = drive_dbc_of_phases(DRIVE_DBC.read_text(encoding="ascii"), _PHASES)
+        text = drive_dbc_of_phases(DRIVE_DBC.read_text(encoding="ascii"), FIRST_PHASES)
     else:
         path = machine_path(machine)
         text = scaling_of(path, load_machine(path)).dbc()

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 
 from salient.cli import make_parser
+from salient.generate.files import cell
 from salient.paths import BUILD, OUT, REFERENCE, from_root
 
 PAGE = REFERENCE / "commands.md"
@@ -41,7 +42,7 @@ def _cell(text: str) -> str:
     """A text within a row of a table; folders are those without SALIENT_BUILD."""
     for folder, shown in ((str(OUT), "out"), (from_root(BUILD), "build")):
         text = text.replace(folder, shown)
-    return " ".join(text.split()).replace("|", " or ").replace("<", "&lt;")
+    return cell(text.replace("|", " or "))
 
 
 def _row(parser: argparse.ArgumentParser, action: argparse.Action) -> str:

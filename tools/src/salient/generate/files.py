@@ -1,4 +1,4 @@
-"""Writes generated files: the part that the command lines of the generators share."""
+"""Generated files: the parts that the generators share."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -22,3 +22,8 @@ def write_files(
         print(f"{program}: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     return 0
+
+
+def cell(text: str) -> str:
+    """A text on one line of a generated Markdown page, as in a cell of a table."""
+    return " ".join(text.split()).replace("<", "&lt;")

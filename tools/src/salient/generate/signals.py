@@ -11,11 +11,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from cantools.database.can import Message, Signal
+import cantools
+from cantools.database.can import Database, Message, Signal
 
-from salient.bus.signals import drive_database, rig_database
 from salient.dbc import attributes
-from salient.paths import REFERENCE
+from salient.generate.files import cell
+from salient.paths import DRIVE_DBC, REFERENCE, RIG_DBC, ROOT
 
 _HEAD = """# {title}
 
@@ -37,14 +38,14 @@ class Page:
 
     path: Path
     title: str
-    source: str
+    source: Path
     text: str
 
 
-DRIVE = Page(REFERENCE / "drive-signals.md", "Signals of the drive", "firmware/comms/drive.dbc",
+DRIVE = Page(REFERENCE / "drive-signals.md", "Signals of the drive", DRIVE_DBC,
              "Identifiers, factors and ranges hold for node 0 and the machine `saturating`. This writes another DBC:\n"
              "`tools/salient machine NAME --node N --dbc FILE.dbc`.")
-RIG = Page(REFERENCE / "rig-signals.md", "Signals of the test bench", "emulator/rig/rig.dbc",
+RIG = Page(REFERENCE / "rig-signals.md", "Signals of the test bench", RIG_DBC,
            "The *rig* is the emulator's test bench: clock, load, faults, true state. Its identifiers have 29 bits; a\n"
            "real drive has no such messages. Signals of `RIG_SET` are the variables `bench.rig.NAME` of a test.")
 
@@ -63,11 +64,7 @@ def _row(signal: Signal) -> str:
     selected = f" ({signal.multiplexer_signal} {', '.join(map(str, signal.multiplexer_ids))})" \
         if signal.multiplexer_ids else ""
     return " | ".join((f"| `{signal.name}`{selected}", bits, _number(signal.scale) if not signal.choices else "",
-                       signal.unit or "", _named(signal) or limits, f"{_cell(signal.comment)} |"))
-
-
-def _cell(text: str | None) -> str:
-    return " ".join((text or "").split()).replace("<", "&lt;")
+                       signal.unit or "", _named(signal) or limits, f"{cell(signal.comment or '')} |"))
 
 
 def _section(message: Message) -> str:
@@ -76,14 +73,20 @@ def _section(message: Message) -> str:
         if "E2EDataId" in attributes(message) else ""
     facts = f"Identifier `0x{message.frame_id:03X}`, {message.length} bytes{cycle}{protected}."
     rows = "\n".join(map(_row, message.signals))
-    return (f"\n## {message.name}\n\n{facts} {_cell(message.comment)}\n\n"
+    return (f"\n## {message.name}\n\n{facts} {cell(message.comment or '')}\n\n"
             f"| signal | bits | LSB | unit | range | meaning |\n|{' --- |' * 6}\n{rows}\n")
 
 
 def pages() -> dict[Path, str]:
     """The text of each page."""
-    return {of.path: _HEAD.format(title=of.title, source=of.source, text=of.text) + "".join(map(_section, messages))
-            for of, messages in ((DRIVE, drive_database().messages), (RIG, rig_database().messages))}
+    return {of.path: _HEAD.format(title=of.title, source=of.source.relative_to(ROOT), text=of.text)
+            + "".join(map(_section, _messages(of.source))) for of in (DRIVE, RIG)}
+
+
+def _messages(source: Path) -> list[Message]:
+    database = cantools.database.load_file(source)
+    assert isinstance(database, Database)  # as every DBC gives
+    return database.messages
 
 
 def main() -> int:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
-from salient.dbc import PHASES_MAX
+from salient.dbc import PHASES_MAX, PHASES_MIN
 from salient.errors import close_names, shown
 from salient.machine.contradictions import contradiction
 from salient.machine.definition import Machine, MachineError
@@ -30,8 +30,6 @@ __all__ = ["FORMS", "MAGNETICS", "Converter", "Machine", "MachineError", "Machin
 
 FORMS = (*FORMULA_KEYS, "map")
 
-PHASES_MIN = 3
-"""With fewer there is an angle at which no phase has a torque in the wanted direction."""
 ROTOR_POLES = range(2, 41)
 """A misalignment of 4 mechanical degrees, which the drive learns, is less than half a revolution of its angles."""
 STATOR_POLES = range(PHASES_MIN, PHASES_MAX * (ROTOR_POLES.stop - 1) + 1)

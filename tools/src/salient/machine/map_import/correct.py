@@ -344,6 +344,12 @@ def _half(phase: _Phase, aligned_rad: float, way: float, grid_rad: np.ndarray) -
     return read
 
 
+def _largest(values: np.ndarray) -> tuple[int, int, float]:
+    """Row, column and value of the largest element."""
+    row, column = divmod(int(np.argmax(values)), values.shape[1])
+    return row, column, float(values[row, column])
+
+
 def _compare_halves(halves: Sequence[tuple[np.ndarray | None, np.ndarray | None]], most_Wb: float,
                     current_A: np.ndarray, place: Callable[[int, int, int, int], str], lines: list[str]) -> None:
     worst, told = 0.0, ""
@@ -351,10 +357,10 @@ def _compare_halves(halves: Sequence[tuple[np.ndarray | None, np.ndarray | None]
         if after is None or before is None:
             continue
         difference = np.abs(after - before) / most_Wb
-        row, column = np.unravel_index(int(np.argmax(difference)), difference.shape)
-        if difference[row, column] >= worst:
-            worst = float(difference[row, column])
-            lines_of = " and ".join(place(phase, half, int(row), int(column)) for half in (0, 1))
+        row, column, largest = _largest(difference)
+        if largest >= worst:
+            worst = largest
+            lines_of = " and ".join(place(phase, half, row, column) for half in (0, 1))
             told = f"{lines_of}, {current_A[column]:.5g} A"
     if not told:
         lines.append("asymmetry: unknown, half a pitch")
@@ -377,8 +383,7 @@ def _compare_beyond(phase: _Phase, origin: Origin, both: tuple[np.ndarray | None
     away_rad = np.abs(np.remainder(way * (phase.angle_rad - origin.aligned_rad) + math.pi, 2.0 * math.pi) - math.pi)
     mirrored = CubicSpline(np.linspace(0.0, math.pi, len(half)), half)(away_rad)
     difference = np.abs(phase.flux_Wb - mirrored) / most_Wb
-    row, column = np.unravel_index(int(np.argmax(difference)), difference.shape)
-    worst = float(difference[row, column])
+    row, column, worst = _largest(difference)
     if worst > ASYMMETRY_MAX:
         raise FluxMapError(
             f"line {phase.line[row, column]}, {current_A[column]:.5g} A: beyond the end of half a pitch the flux"
@@ -391,10 +396,9 @@ def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.n
     if len(means) < 2:
         return
     spread = np.ptp(np.array(means), axis=0) / most_Wb
-    row, column = np.unravel_index(int(np.argmax(spread)), spread.shape)
+    row, column, worst = _largest(spread)
     away = [abs(float(mean[row, column] - np.median([of[row, column] for of in means]))) for mean in means]
-    told = f"{place(int(np.argmax(away)), int(row), int(column))}, {current_A[column]:.5g} A"
-    worst = float(spread[row, column])
+    told = f"{place(int(np.argmax(away)), row, column)}, {current_A[column]:.5g} A"
     if worst > SPREAD_MAX:
         raise FluxMapError(f"{told}: the phases differ by {100.0 * worst:.1f} % of the largest flux linkage; must be"
                            f" within {SPREAD_MAX:.0%}")
@@ -419,11 +423,10 @@ def _monotonic(flux_Wb: np.ndarray, current_A: np.ndarray) -> np.ndarray:
 def _check_monotonic(flux_Wb: np.ndarray, current_A: np.ndarray, place: Callable[[int, int], str]) -> float:
     """The largest change of a curve, as a fraction of the aligned flux linkage at its current."""
     changed = np.abs(_monotonic(flux_Wb, current_A) - flux_Wb)[:, 1:] / np.maximum(np.max(flux_Wb, axis=0)[1:], 1e-300)
-    row, column = np.unravel_index(int(np.argmax(changed)), changed.shape)
-    worst = float(changed[row, column])
+    row, column, worst = _largest(changed)
     if worst > REPAIR_MAX:
         raise FluxMapError(
-            f"{place(int(row), int(column) + 1)}, {current_A[column + 1]:.5g} A: the flux linkage does not fall from"
+            f"{place(row, column + 1)}, {current_A[column + 1]:.5g} A: the flux linkage does not fall from"
             f" aligned to unaligned, or not rise with the current: a dip or a step of {200.0 * worst:.1f} % of the"
             f" aligned flux linkage; must be within {2.0 * REPAIR_MAX:.0%}")
     return worst
