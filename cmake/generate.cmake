@@ -19,9 +19,10 @@ if(SALIENT_MACHINE_FILE)
     list(APPEND SALIENT_MACHINES custom)
 endif()
 
-# salient_generate_codec(TARGET DBC [INTEGER] [NODE name]): a static library with <name>_codec.h/.c generated from DBC.
-# INTEGER leaves every floating-point conversion out. PHASES leaves messages out that only machines of more phases have. NODE adds <name>_enumerations.h, and <name>_telemetry.h/.c with the
-# cyclic messages of that node.
+# salient_generate_codec(TARGET DBC [INTEGER] [NODE name] [PHASES n]): a static library with <name>_codec.h/.c generated
+# from DBC. INTEGER leaves every floating-point conversion out. NODE adds <name>_enumerations.h, and
+# <name>_telemetry.h/.c with the cyclic messages of that node. PHASES leaves messages out that only machines of more
+# phases have.
 function(salient_generate_codec target dbc)
     cmake_parse_arguments(ARG "INTEGER" "NODE;PHASES" "" ${ARGN})
     get_filename_component(name ${dbc} NAME_WE)
