@@ -95,6 +95,7 @@ KINDS = {
     "live_page": Kind("benchmark --page 2"),
     "pil": Kind("pil {folder}/some.toml --out {folder}/pil"),
     "tab": Kind("tab --out {folder}/tab.html"),
+    "docs": Kind("docs --out {folder}/docs"),
     "wheel": Kind("wheel --out {folder}/wheel"),
     "test": Kind("test --only unit"),
     "fault_table": Kind("--jobs 2", module="salient.experiments.fault_table"),

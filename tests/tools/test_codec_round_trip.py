@@ -13,7 +13,7 @@ from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
 
-from salient.dbc import database_hash
+from salient.dbc import database_hash, phases_above
 from salient.generate.codec import generate_codec, main
 from salient.generate.error import CodecError
 from salient.generate.ranges import raw_range
@@ -313,6 +313,7 @@ def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
         _fields_ = [
             ("identifier", ctypes.c_uint32), ("length", ctypes.c_uint8),
             ("group", ctypes.c_uint8), ("rate", ctypes.c_uint8), ("if_active", ctypes.c_bool),
+            ("phases_above", ctypes.c_uint8),
             ("period", ctypes.c_uint16), ("delay", ctypes.c_uint16),
         ]  # fmt: skip
 
@@ -321,13 +322,14 @@ def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
         assert (row.identifier, row.length) == (message.frame_id, message.length)
         assert row.group == telemetry.attribute(message, "TelemetryGroup")
         assert row.rate == telemetry.attribute(message, "TelemetryRate")
+        assert row.phases_above == phases_above(message)
         assert row.if_active == (message.send_type == "cyclicIfActive")
         assert (row.period, row.delay) == (message.cycle_time, telemetry.attribute(message, "GenMsgStartDelayTime"))
     periods = {m.name: (telemetry.attribute(m, "TelemetryRate"), m.cycle_time) for m in telemetry.messages}
     parameters = {row.name: row.default for row in read_table()}
     fast, slow = (1, parameters["telemetry_period_ms"]), (2, parameters["telemetry_slow_period_ms"])
     assert [name for name, period in periods.items() if period == fast] == [
-        "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS",
+        "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS", "DRIVE_PHASES_E_F",
     ]  # fmt: skip
     assert {name for name, period in periods.items() if period == slow} == {"DRIVE_BP_PID", "DRIVE_ADAPTATION"}
     assert {rate for rate, _ in periods.values()} == {0, 1, 2}

@@ -141,11 +141,11 @@ def test_ripple_of_the_paper_controller_is_below_the_published_one(demo_metrics)
 
 
 def readme_table(first_cell):
-    """Row -> controller -> cell, of the table in the documents that has a row with this first cell. Columns not
-    headed by a controller's name are omitted."""
+    """Row -> controller -> cell, of the table of controllers in the documents that has a row with this first cell.
+    Columns not headed by a controller's name are omitted."""
     text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/machines/file.md"))
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
-    (table,) = (table for table in tables if f"\n| {first_cell} |" in table)
+    (table,) = (table for table in tables if f"\n| {first_cell} |" in table and "| traditional |" in table)
     heads, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines())
     assert set(heads[1:]) <= {*ALL_CONTROLLERS, "published"}
     return {row[0]: {head: cell for head, cell in zip(heads, row, strict=True) if head in ALL_CONTROLLERS}

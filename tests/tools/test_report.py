@@ -141,7 +141,7 @@ def lab(colour, eyes):
 def test_colours_of_the_phases_on_the_live_page_are_distinguishable_with_any_colour_vision(eyes):
     palette = (ROOT / "tools/src/salient/view/page/palette.js").read_text()
     colours = re.findall("#[0-9a-f]{6}", re.search(r"PHASE_COLOURS = \[(.*?)\]", palette)[1])
-    assert len(colours) == 4
+    assert len(colours) == 6
     for one, other in combinations(colours, 2):
         assert 20.0 < np.linalg.norm(lab(one, eyes) - lab(other, eyes)) < 150.0, (one, other)
 

@@ -32,7 +32,8 @@ _LOOK = _PACKAGE / "pages" / "look.css"
 _ENTRY = "main_tab.js"
 _ONLY_LIVE = ("live.js", "main.js")
 _SPECIFIER = re.compile(r'(\b(?:from|import)\s+)"\.[^"]*?([\w-]+\.js)"')
-_COMMENT = re.compile(r"^ *(?://.*|(?s:/\*\*.*?\*/))\n", re.MULTILINE)
+_COMMENT = re.compile(r"^ *(?://.*|(?s:/\*\*.*?\*/))\n| +// .*$", re.MULTILINE)
+"""Comments on lines of their own, and those after code; no text of the page has " // "."""
 _UNESCAPED = " !$&'()*+,-./:;=?@[]_{|}~`^"
 """Characters that a data: address within an attribute of HTML has as they are."""
 
@@ -86,7 +87,7 @@ def _import_map() -> str:
 
 
 def _module_text(path: Path) -> str:
-    """A module whose imports name modules of the map; without its comments at the beginnings of lines."""
+    """A module whose imports name modules of the map; without its comments."""
     return _SPECIFIER.sub(r'\1"salient/\2"', _COMMENT.sub("", path.read_text(encoding="utf-8")))
 
 

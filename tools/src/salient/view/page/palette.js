@@ -1,9 +1,9 @@
 // Colours of Okabe and Ito, in an order in which the first ones differ most to any eye; without the yellow, too light on
-// white.
+// white. Those of the phases are told apart by any eye; E and F are not of Okabe and Ito.
 
 export const COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9", "#009e73", "#e69f00", "#cc79a7"];
+export const PHASE_COLOURS = ["#0072b2", "#d55e00", "#000000", "#56b4e9", "#7711dd", "#996655"];
 export const PHASE_NAMES = ["A", "B", "C", "D", "E", "F"];
-export const PHASE_COLOURS = COLOURS.slice(0, PHASE_NAMES.length);
 
 /** Colour and dash of the n-th signal of a plot: the dash tells those of the same colour apart. */
 export function lineStyle(index) {
