@@ -24,8 +24,8 @@ static uint32_t percent(uint32_t load_q16) {
     return (uint32_t)(((uint64_t)load_q16 * 10000u + (1u << 15)) >> 16);
 }
 
-/* Mean of the phases, mechanical, 2^-32 turn, within an LSB for each phase: six offsets have a sum beyond 32 bits, whose
- * division in software would take longer than the control interrupt, in a critical section. */
+/* Mean of the phases, mechanical, 2^-32 turn, within an LSB for each phase. Six offsets have a sum beyond 32 bits,
+ * whose division in software, within a critical section, would take longer than the control interrupt. */
 static int32_t misalignment(const drive_t *drive) {
     const int32_t phases = machine_tables.phases, divisor = phases * machine_tables.rotor_poles;
     int32_t mean = 0;
