@@ -102,7 +102,7 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs")
+WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs", "evidence")
 """Commands that need no drive."""
 
 

@@ -96,6 +96,7 @@ KINDS = {
     "pil": Kind("pil {folder}/some.toml --out {folder}/pil"),
     "tab": Kind("tab --out {folder}/tab.html"),
     "docs": Kind("docs --out {folder}/docs"),
+    "evidence": Kind("evidence --out {folder}/evidence.html"),
     "wheel": Kind("wheel --out {folder}/wheel"),
     "test": Kind("test --only unit"),
     "fault_table": Kind("--jobs 2", module="salient.experiments.fault_table"),

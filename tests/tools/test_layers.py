@@ -38,7 +38,7 @@ PYTHON_LAYERS = (
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
     "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
-    "salient.documents",
+    "salient.documents", "salient.evidence",
     "salient.__main__",
 )  # fmt: skip
 

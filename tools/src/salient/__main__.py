@@ -187,6 +187,12 @@ def _docs(options: argparse.Namespace) -> int:
     return documents.run(options.out, generate=options.generate)
 
 
+def _evidence(options: argparse.Namespace) -> int:
+    from salient import evidence
+
+    return evidence.run(options.out, options.names, rerun=options.run)
+
+
 def _pil(options: argparse.Namespace) -> int:
     from salient.target.pil import run
 
@@ -226,6 +232,7 @@ _COMMANDS = {
     "pil": _pil,
     "wheel": _wheel,
     "docs": _docs,
+    "evidence": _evidence,
 }
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
-CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay", "docs")
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay", "docs", "evidence")
 """Commands that need the sources."""
 _SHOWN_OUT, _SHOWN_BUILD = (text.replace("%", "%%") for text in (str(OUT), from_root(BUILD)))
 """For argparse, which formats a text of help."""
@@ -250,6 +250,13 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     docs.add_argument("--out", type=Path, default=OUT / "docs", metavar="DIR", help="folder (default %(default)s)")
     docs.add_argument("--generate", action="store_true",
                       help="first write the reference pages that follow from the sources")
+
+    evidence = command("evidence", "each claim about the drive with its measurement, and whether that holds: a page")
+    evidence.add_argument("names", nargs="*", metavar="NAME", help="claims of tests/evidence.toml (default all)")
+    evidence.add_argument("--out", type=Path, default=OUT / "evidence.html", metavar="FILE.html",
+                          help="page (default %(default)s)")
+    evidence.add_argument("--run", action="store_true",
+                          help="first run the commands of the claims that are red: hours, resumable")
 
     scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
                     "plot")
