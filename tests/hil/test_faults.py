@@ -278,15 +278,15 @@ def test_several_faults_are_present_together_and_end_each_by_itself(bench: Bench
     ("winding_opened", {}, "no fault 'winding_opened'; the nearest of .* are winding_open, [a-z_]+, [a-z_]+$"),
     ("winding_open", {}, "winding_open: phase missing: must be a, b, c, d, e or f"),
     ("winding_open", {"phase": "g"}, "winding_open: phase 'g': must be a, b, c, d, e or f"),
-    ("winding_open", {"phase": "d"}, "winding_open d at 0 us: no_such_place"),
+    ("winding_open", {"phase": "d"}, "winding_open d: no_such_place, a phase that the machine does not have"),
     ("winding_open", {"phase": "a", "leg": "low"}, "winding_open has no leg; it has phase"),
     ("switch_open", {"phase": "a", "leg": "top"}, "leg 'top': must be high or low"),
     ("encoder_stuck", {"gain": 1}, "encoder_stuck has no gain; it has no place and no attribute"),
     ("current_sensor_gain", {"phase": "a"}, "gain missing: must be 0 to 10"),
     ("current_sensor_gain", {"phase": "a", "gain": 11}, "gain 11: must be 0 to 10"),
     ("current_sensor_gain", {"phase": "a", "gain": float("nan")}, "gain nan: must be 0 to 10"),
-    ("current_sensor_swapped", {"phase": "a", "with_phase": "d"}, "current_sensor_swapped a at 0 us: no_such_place"),
-    ("chopper_open", {}, "chopper_open at 0 us: unsupported"),
+    ("current_sensor_swapped", {"phase": "a", "with_phase": "d"}, "current_sensor_swapped a: no_such_place, a phase that the machine does not have"),
+    ("chopper_open", {}, "chopper_open: unsupported"),
 ])
 def test_what_does_not_exist_is_an_error_that_names_what_does(bench: Bench, kind: str, arguments: dict, text: str
                                                               ) -> None:

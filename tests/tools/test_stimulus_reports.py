@@ -67,6 +67,26 @@ def test_refused(bench):
     running(bench)
     bench.fault("current_sensor_gain", phase="d", gain=0.3)
 
+def test_tripped(bench):
+    running(bench)
+    bench.fault("encoder_stuck")
+    bench.run_for(0.05)
+    bench.load_torque_Nm = 4
+    bench.run_for(0.05)
+    assert bench.time_s < 0
+
+def test_not_ready(bench):
+    bench.rig.sto_1 = 1
+    bench.drive.speed_reference_rpm = 400
+    bench.run_for(0.1)
+    assert bench.time_s < 0
+
+def test_short_fault(bench):
+    running(bench)
+    bench.fault("supply_sagged", duration_s=0.01, depth_percent=30)
+    bench.run_for(0.02)
+    assert bench.time_s < 0
+
 def test_nothing(bench):
     bench.run_for(0.05)
     assert bench.time_s < 0
@@ -124,8 +144,8 @@ def test_the_last_stimulus_is_in_the_first_three_lines(suite, name):
     root, reports = suite
     report = reports[name]
     text = STIMULI[name][1]
-    head = [line for line in report[:3] if text in line]
-    assert len(head) == 1 and head[0].startswith("last stimulus: "), report
+    head = [line for line in report[:3] if text in line and line.startswith("last stimulus: ")]
+    assert len(head) == 1, report
     of_file = [stimulus for stimulus in notes(root, name)["stimuli"] if stimulus["text"] == text]
     assert len(of_file) == 1
     assert of_file[0]["time_s"] == pytest.approx(0.05, abs=0.03 if name == "parameter" else 1e-9)
@@ -163,6 +183,30 @@ def test_commands_that_cease_are_a_stimulus(suite):
 
 def test_a_refused_fault_is_named_with_the_reason(suite):
     assert "fault current_sensor_gain begins, phase d, gain 0.3 (refused: " in suite[1]["refused"][0]
+
+
+def test_a_trip_is_named_with_the_stimulus_before_it_although_others_came_later(suite):
+    head = suite[1]["tripped"][1]
+    assert "load_torque_Nm = 4 N m" in suite[1]["tripped"][0]
+    found = re.fullmatch(r"the drive: tripped: encoder, reported at 0\.(\d+) s, (\d+\.\d+) ms after fault encoder_stuck"
+                         r" begins", head)
+    assert found is not None, head
+    assert 0.05 < float(f"0.{found[1]}") == pytest.approx(0.05 + float(found[2]) / 1e3, abs=2e-6)
+    assert notes(suite[0], "tripped")["drive"] == head.removeprefix("the drive: ")
+
+
+def test_a_drive_that_is_not_ready_is_named_with_its_check(suite):
+    assert suite[1]["not_ready"][1] == "the drive: not ready: its check sto fails"
+
+
+def test_the_end_of_a_fault_is_named_with_its_beginning(suite):
+    head = suite[1]["short_fault"][0]
+    assert "0.060000 s fault supply_sagged ends" in head
+    assert "; it began at 0.050000 s" in head
+
+
+def test_a_drive_that_runs_has_no_line_of_its_own(suite):
+    assert not [line for line in suite[1]["load"] if line.startswith("the drive")]
 
 
 def test_nothing_done_is_said(suite):

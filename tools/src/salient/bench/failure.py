@@ -4,6 +4,7 @@ and replay command."""
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -42,10 +43,11 @@ _STIMULUS_COLOUR = "#009e73"
 
 @dataclass(frozen=True)
 class Saved:
-    """Report on a bench. last: the stimulus before the failure; stimuli: all of them, in order; changes:
-    what changed just before."""
+    """Report on a bench. last: the stimulus before the failure; drive: that it has tripped, or why it does not run,
+    else empty; stimuli: all of them, in order; changes: what changed just before."""
 
     last: str
+    drive: str
     stimuli: list[str]
     changes: list[str]
 
@@ -64,9 +66,10 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     plot_moment(session, moment_s, title, folder / "last_second.png", acts, TRUTH_S)
     last = _last(acts, moment_s, title)
     changed = changes(session, moment_s, acts)
-    about: dict[str, Any] = {"virtual_time_s": session.time_s, "last_stimulus": last,
-                             STIMULI: [asdict(stimulus) for stimulus in acts], "changes_before_the_failure": changed}
     fault = first_fault(session)
+    drive = _drive(session, fault, acts)
+    about: dict[str, Any] = {"virtual_time_s": session.time_s, "last_stimulus": last, "drive": drive,
+                             STIMULI: [asdict(stimulus) for stimulus in acts], "changes_before_the_failure": changed}
     if fault is not None:
         time_s, name = fault
         plot_moment(session, time_s, f"first fault: {name}", folder / "first_fault.png", acts)
@@ -79,7 +82,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     _write_page(folder, about | {"error": error, STIMULI: [str(stimulus) for stimulus in acts]}, title)
-    return Saved(last, [str(stimulus) for stimulus in acts], changed)
+    return Saved(last, drive, [str(stimulus) for stimulus in acts], changed)
 
 
 def clear(folder: Path) -> None:
@@ -200,12 +203,29 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path,
     figure.savefig(path, dpi=110)
 
 
+def _drive(session: Session, fault: tuple[float, str] | None, acts: Sequence[Stimulus]) -> str:
+    """The first fault of the drive, with the act before it; else the check that keeps it from running."""
+    if fault is not None:
+        time_s, name = fault
+        before = last_before(acts, time_s)
+        since = "" if before is None else f", {1e3 * (time_s - before.time_s):.3f} ms after {before.text}"
+        return f"tripped: {name}, reported at {time_s:.6f} s{since}"
+    if session.telemetry["DRIVE_STATUS.state"].last_name == "initialise":
+        return f"not ready: its check {session.telemetry['DRIVE_STATUS.start_inhibited_by'].last_name} fails"
+    return ""
+
+
 def _last(acts: Sequence[Stimulus], moment_s: float, title: str) -> str:
-    """The last act by a moment, and when it has not had any time to act the one before it."""
+    """The last act by a moment, with the beginning of a fault that it ends; when it has not had any time to act also
+    the one before it."""
     done = [stimulus for stimulus in acts if stimulus.time_s <= moment_s]
     if not done:
         return "none"
     text = f"{done[-1]}, {1e3 * (moment_s - done[-1].time_s):.3f} ms before the {title}"
+    ended = re.search(r"fault \w+ (?=ends)", done[-1].text)
+    begun = [stimulus for stimulus in done if ended and f"{ended[0]}begins" in stimulus.text]
+    if begun:
+        text += f"; it began at {begun[-1].time_s:.6f} s"
     earlier = last_before(done, moment_s - _TIME_TO_ACT_S)
     return text if earlier in (None, done[-1]) else f"{text}; before it {earlier}"
 

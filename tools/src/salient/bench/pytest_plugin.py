@@ -290,8 +290,10 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
             seeds.append(str(bench.options.seed))
         of = f" of bench {number}" if len(state.benches) > 1 else ""
         heads.append(f"last stimulus{of}: {saved.last}")
-        lines.append(f"log, plot, seed {seeds[-1] if seeds else 'none'}: {of_bench}; at {bench.time_s:.6f} s")
-        lines.append(f"everything that was done{of}:")
+        heads += [f"the drive{of}: {saved.drive}"] if saved.drive else []
+        seed = f"seed {seeds[-1]}, " if seeds else ""
+        lines.append(f"log and plots ({seed}ended at {bench.time_s:.6f} s): {of_bench}")
+        lines.append(f"everything that was done{of.replace('of', 'to')}:")
         if len(saved.stimuli) > _STIMULI_SHOWN:
             lines.append(f"    {len(saved.stimuli) - _STIMULI_SHOWN} earlier ones: {of_bench / 'failure.html'}")
         lines += [f"    {stimulus}" for stimulus in saved.stimuli[-_STIMULI_SHOWN:]] or ["    nothing"]

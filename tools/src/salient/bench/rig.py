@@ -114,7 +114,7 @@ class Rig:
         if not (is_free or fine_low <= value <= fine_high):
             signal = _coarse(name) or signal
         if not 0 <= self._at_us <= _AT_US_MAX:
-            raise RigError(f"{name} at {self._at_us} us: must be 0 to {_AT_US_MAX} us")
+            raise RigError(f"{name} at {self._at_us / 1e6:g} s: must be 0 to {_AT_US_MAX / 1e6:g} s")
         message = self._client.rig_database.get_message_by_name("RIG_SET")
         number = _multiplex_number(signal)
         data = message.encode({"quantity": number, signal.name: _FREE if is_free else value, "at_us": self._at_us})
@@ -125,7 +125,7 @@ class Rig:
         )
         status = reply.decode_simple(bytes(answer.data))["status"]
         if status != "done":
-            raise RigError(f"{name} {value:g} at {self._at_us} us: {status}")
+            raise RigError(f"{name} {value:g}{self._refused(self._at_us, str(status))}")
 
     def set_load_profile(self, values: str | Sequence[float]) -> None:
         """Sets the load profile, now: torque over one turn of the rotor at equal steps of its angle from 0, times
@@ -169,7 +169,7 @@ class Rig:
     def _change_fault(self, signals: dict[str, Any]) -> None:
         kind, at_us = signals["kind"], signals["at_us"]
         if not 0 <= at_us <= _AT_US_MAX:
-            raise FaultError(f"{kind} at {at_us} us: must be 0 to {_AT_US_MAX} us")
+            raise FaultError(f"{kind} at {at_us / 1e6:g} s: must be 0 to {_AT_US_MAX / 1e6:g} s")
         message = self._client.rig_database.get_message_by_name("RIG_FAULT")
         data = message.encode(signals)
         self._client.send(can.Message(arbitration_id=message.frame_id, is_extended_id=True, data=data))
@@ -181,7 +181,16 @@ class Rig:
         if status != "done":
             places = "".join(f" {value}" for name, value in signals.items()
                              if name in (f"{kind}_phase", f"{kind}_leg"))
-            raise FaultError(f"{kind}{places} at {at_us} us: {status}")
+            raise FaultError(f"{kind}{places}{self._refused(at_us, str(status))}")
+
+    def _refused(self, at_us: int, status: str) -> str:
+        """When a request was to have its effect, and why the test bench has refused it."""
+        at = f" at {at_us / 1e6:g} s" if at_us else ""
+        if status == "in_the_past":
+            return f"{at}: in_the_past, it is {self._client.time_ns / 1e9:g} s"
+        if status == "no_such_place":
+            return f"{at}: no_such_place, a phase that the machine does not have"
+        return f"{at}: {status}"
 
     @staticmethod
     def describe() -> str:

@@ -229,6 +229,7 @@ class Session(KnownAttributes):
         AssertionError when it does not hold within `timeout` seconds of virtual time. UsageError when the condition is
         no function, and when timeout or step_s is negative or no number, or step_s 0.
         """
+        __tracebackhide__ = True  # pytest shows the line of the test
         if not callable(condition):
             raise UsageError(f"run_until: condition {shown(condition)}: must be a function, called at every step,"
                              " as in run_until(lambda: ..., timeout=1.0); a value was computed once, before the call")

@@ -91,6 +91,13 @@ class Signal:
     def __len__(self) -> int:
         return len(self.value)
 
+    def __repr__(self) -> str:
+        """Short: a failed assertion prints it."""
+        if not len(self):
+            return f"<{self.name}: no value yet>"
+        last = self.last_name if self.choices else f"{self.last:g} {self.unit}".rstrip()
+        return f"<{self.name}: {len(self)} values, the last one {last} at {self.last_time_s:g} s>"
+
     @property
     def last(self) -> float:
         """The latest value; not-a-number, for which no comparison is true, before the first."""
