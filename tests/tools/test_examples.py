@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from matplotlib.image import imread
 
 from salient.bench.emulator import EmulatorProcess
 from salient.bus.clock import open_bus
@@ -40,6 +41,28 @@ def test_read_telemetry_waits_for_the_drive_and_prints_decoded_frames(channel):
     lines = output.splitlines()
     assert len(lines) == 20
     assert any(" DRIVE_MOTION {'speed_rpm': 0.0" in line for line in lines)
+
+
+@pytest.mark.in_turns
+def test_plot_speed_runs_the_drive_and_draws_its_speed(channel, tmp_path):
+    # One tenth of real time, as below; the plot has the drive's time.
+    with EmulatorProcess(BenchConfig(pace="x0.1"), channel):
+        done = run(tmp_path, sys.executable, "-W", "error", EXAMPLES / "plot_speed.py", channel, MPLBACKEND="Agg")
+    assert (done.returncode, done.stderr) == (0, "")
+    image = imread(tmp_path / "speed.png")
+    curve = (abs(image[:, :, :3] - (0x1f / 255, 0x77 / 255, 0xb4 / 255)) < 0.1).all(axis=2)
+    rows, columns = curve.nonzero()
+    top = columns[rows <= rows.min() + 2]  # at 600 r/min for most of the time
+    assert 0.5 < len(set(top)) / (columns.max() - columns.min()) < 0.8
+
+
+def test_the_script_of_the_quick_start_is_the_example():
+    text = (ROOT / "docs" / "start" / "can.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    own = (EXAMPLES / "plot_speed.py").read_text(encoding="utf-8").split('"""\n', 1)[1]
+    path = 'Path(__file__).resolve().parents[2] / "firmware" / "comms" / "drive.dbc"'
+    own = own.replace("from pathlib import Path\n", "")
+    assert shown == own.replace(path, '"/path/to/clone/firmware/comms/drive.dbc"')
 
 
 @pytest.mark.in_turns

@@ -10,4 +10,6 @@ def test_load_step_is_compensated(bench: Bench) -> None:
     bench.drive.speed_reference_rpm = 150
     bench.at(0.13).load_torque_Nm = 8
     bench.run_for(0.3)
-    assert 149.2 < bench.truth["speed_rpm"].last < 150.8
+    speed = bench.truth["speed_rpm"]
+    assert 149.2 < speed.last < 150.8
+    assert 146.0 < speed.between(0.13, 0.3).value.min() < 149.0  # the dip

@@ -171,18 +171,22 @@ def _compiled(bug: Bug, folder: Path) -> list[tuple[Path, Path]]:
             if f'#include "{included}"' in path.read_text(encoding="utf-8")]
 
 
+def compiling(bug: Bug, source: Path, target: str) -> list[str]:
+    """Compiler and options with which the build compiles a source for a target; UsageError when it does not."""
+    line = next((shlex.split(line) for line in _commands(target) if line.endswith(f"-c {source}")), None)
+    if line is None:
+        raise UsageError(f"{bug.table.name}: {bug.name}: {source.relative_to(ROOT)} is no part of {target}")
+    return line[:line.index("-MD")]
+
+
 def build(bug: Bug, folder: Path, *targets: str) -> list[Path]:
     """Programs with the bug in a folder: its file compiled, and they linked, as the build does it."""
     folder.mkdir(parents=True, exist_ok=True)
     made = []
     for source, place in _compiled(bug, folder):
-        suffix = f"-c {source}"
-        compiling = next((shlex.split(line) for line in _commands(targets[0]) if line.endswith(suffix)), None)
-        if compiling is None:
-            raise UsageError(f"{bug.table.name}: {bug.name}: {source.relative_to(ROOT)} is no part of {targets[0]}")
+        compiler, *options = compiling(bug, source, targets[0])
         made.append(folder / f"{source.stem}.o")
-        _execute(bug, [compiling[0], f"-I{folder}", *compiling[1:compiling.index("-MD")], *_WARNINGS,
-                       "-o", str(made[-1]), "-c", str(place)])
+        _execute(bug, [compiler, f"-I{folder}", *options, *_WARNINGS, "-o", str(made[-1]), "-c", str(place)])
     for target in targets:
         link = next(part for part in _commands(target)[-1].split(" && ") if f" -o bin/{target} " in part)
         linking = shlex.split(link)
@@ -307,7 +311,7 @@ def _look(arguments: tuple[Bug, str, Path, int]) -> Finding:
 # --- Results --------------------------------------------------------------------------------------------------------
 
 
-def _sources(kind: str) -> str:
+def sources(kind: str) -> str:
     """Hash of what findings of a kind depend on."""
     listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "--deduplicate", *_DEPENDS_ON[kind]],
                             cwd=ROOT, capture_output=True, text=True, check=True).stdout
@@ -359,9 +363,9 @@ def run(chosen: Sequence[Bug], kinds: Sequence[str], out: Path, seeds_max: int =
     for bug in chosen:
         bug.text()
         check_finders(bug)
-    sources = {kind: _sources(kind) for kind in kinds}
+    depended = {kind: sources(kind) for kind in kinds}
     build_unchanged(sorted({finder for bug in chosen for finder in bug.found_by if kind_of(finder) in kinds}))
-    looks = [tasks.Task(_key(bug, kind, sources[kind], seeds_max), (bug, kind, out, seeds_max))
+    looks = [tasks.Task(_key(bug, kind, depended[kind], seeds_max), (bug, kind, out, seeds_max))
              for bug in chosen for kind in kinds if bug.finders(kind)]
     found: dict[str, dict[str, Finding]] = {bug.name: {} for bug in chosen}
     with Progress(steps_of(len(looks), sys.stderr), sys.stderr, len(looks)) as progress:
