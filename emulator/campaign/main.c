@@ -2,6 +2,7 @@
  *
  *   salient_campaign --machines FILE [--first SEED] [--seeds N] [--step N] [--healthy] [--keep MASK]
  *                    [--frames FILE] [--describe] [--serve] [--branch CONTROLLER SPEED_RPM LOAD_NM FIRST TICKS EVERY]
+ *                    [--flips CONTROLLER STATE FIRST COUNT STEP]
  *
  * --serve reads the seeds from standard input, a line each.
  *
@@ -20,6 +21,7 @@
 #include <unistd.h>
 
 #include "campaign/branch.h"
+#include "campaign/flips.h"
 #include "campaign/run.h"
 #include "campaign/world_draw.h"
 #include "host/host_drive.h"
@@ -133,7 +135,8 @@ typedef struct {
     uint64_t first, seeds, step, keep;
     bool healthy, describe, serve;
     branch_setting_t branch;
-    bool branches;
+    flips_setting_t flip;
+    bool branches, flips;
 } arguments_t;
 
 static int run_seed(const arguments_t *arguments, uint64_t seed) {
@@ -249,11 +252,20 @@ static int parse_branch(arguments_t *arguments, words_t words) {
     return arguments->branches ? 1 + BRANCH_ARGUMENTS : 0;
 }
 
+static int parse_flips(arguments_t *arguments, words_t words) {
+    if (strcmp(words.words[0], "--flips") != 0 || words.count <= FLIPS_ARGUMENTS) {
+        return 0;
+    }
+    arguments->flips = flips_parse(&arguments->flip, &words.words[1]);
+    return arguments->flips ? 1 + FLIPS_ARGUMENTS : 0;
+}
+
 static bool parse(arguments_t *arguments, int argc, char *argv[]) {
     *arguments = (arguments_t){.seeds = 1, .step = 1, .keep = UINT64_MAX};
     for (words_t words = {argv + 1, argc - 1}; words.count > 0;) {
         int taken = parse_flag(arguments, words.words[0]) ? 1 : parse_value(arguments, words);
         taken = taken ? taken : parse_branch(arguments, words);
+        taken = taken ? taken : parse_flips(arguments, words);
         if (taken == 0) {
             fprintf(stderr, "salient: %s %s: not an option of salient_campaign, or not a whole number\n",
                     words.words[0], words.count > 1 ? words.words[1] : "");
@@ -275,6 +287,9 @@ int main(int argc, char *argv[]) {
     }
     if (arguments.branches) {
         return branch_all(&arguments.branch, &run, &world, machines, &drive);
+    }
+    if (arguments.flips) {
+        return flips_all(&arguments.flip, &run, &world, &machines[0], &drive, &host.drive, sizeof host.drive);
     }
     int code = 0;
     char line[64];

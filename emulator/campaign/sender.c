@@ -227,7 +227,7 @@ static void step_honest(sender_t *sender, const transport_receiver_t *receiver) 
     if (request != sender->request || sender->time_us >= sender->due_us) {
         command(sender, receiver, request);
     }
-    if (request == SENDER_RUN) {
+    if (request == SENDER_RUN || has(sender, WORLD_ARMED)) {
         arm(sender, receiver);
     }
 }

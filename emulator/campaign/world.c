@@ -54,6 +54,7 @@ const char *world_event_name(const world_event_t *event) {
         [WORLD_BEYOND] = "speed_beyond_range",
         [WORLD_DEGRADED] = "degraded_running",
         [WORLD_LIMITED] = "limited_torque",
+        [WORLD_ARMED] = "armed",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name

@@ -40,6 +40,7 @@ typedef enum {
     WORLD_BEYOND,   /* the client commands a speed of `value` times the largest one, from begin to end */
     WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive; what: a check */
     WORLD_LIMITED,  /* before that it sets torque_max_Nm to `value` of the largest torque; what 1: and saves it */
+    WORLD_ARMED,    /* the client arms the drive also while it does not request to run, from begin to end */
 } world_kind_t;
 
 typedef enum {

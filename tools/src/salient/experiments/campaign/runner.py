@@ -94,6 +94,12 @@ def branches(*setting: object) -> list[Result]:
     return _lines(["--branch", *setting])
 
 
+def flips(*setting: object, programs: Programs | None = None) -> list[Result]:
+    """Flipped bits in a state of the drive: first the course without a flip, then those that a flip changes
+    (emulator/campaign/flips.h)."""
+    return _lines(["--flips", *setting], programs)
+
+
 def processor_s() -> float:
     """Processor time of the processes that have ended, of this one's children and theirs."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

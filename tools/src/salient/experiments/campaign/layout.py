@@ -1,0 +1,97 @@
+"""Members of drive_t by their place in memory, from the debug information of salient_campaign."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from elftools.elf.elffile import ELFFile
+
+from salient.errors import UsageError
+
+_ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
+_VARIABLE = b"drive_layout"
+
+
+class Layout:
+    """program: a file with the variable drive_layout, a pointer to the type (emulator/campaign/drive_layout.c).
+    size: of the type in bytes. UsageError: the file has no such variable."""
+
+    def __init__(self, program: Path) -> None:
+        with program.open("rb") as file:
+            elf = ELFFile(file)
+            found = _find(elf.get_dwarf_info()) if elf.has_dwarf_info() else None
+            if found is None:
+                raise UsageError(f"{program}: no debug information of the drive")
+            self._type = _described(_target(_target(found)))
+        self.size: int = self._type["bytes"]
+
+    def member(self, bit: int) -> str:
+        """Name of the member that has a bit, counted from the lowest of the first byte, with the indices of arrays;
+        "padding of" a structure where no member has it."""
+        return _member(self._type, bit, "")
+
+    def bits(self, path: str) -> range:
+        """Bits of a member, by the names from the outermost one on, joined by points. UsageError: there is none."""
+        of, first, length = self._type, 0, 8 * self.size
+        for wanted in path.split("."):
+            found = [member for member in of.get("members", ()) if member[2] == wanted]
+            if not found:
+                raise UsageError(f"{path}: drive_t has no member '{wanted}' there")
+            begin, length, _, of = found[0]
+            first += begin
+        return range(first, first + length)
+
+
+def _find(dwarf: Any) -> Any:
+    for unit in dwarf.iter_CUs():
+        for entry in unit.get_top_DIE().iter_children():
+            name = entry.attributes.get("DW_AT_name")
+            if entry.tag == "DW_TAG_variable" and name is not None and name.value == _VARIABLE:
+                return entry
+    return None
+
+
+def _target(entry: Any) -> Any:
+    """Type of an entry without its aliases."""
+    of = entry.get_DIE_from_attribute("DW_AT_type")
+    while of.tag in _ALIASES:
+        of = of.get_DIE_from_attribute("DW_AT_type")
+    return of
+
+
+def _number(entry: Any, attribute: str) -> int:
+    return int(entry.attributes[attribute].value) if attribute in entry.attributes else 0
+
+
+def _described(entry: Any) -> dict[str, Any]:
+    """A type as bytes, and either members (first bit, bits, name, type) or elements (count, type)."""
+    if entry.tag == "DW_TAG_array_type":
+        of = _described(_target(entry))
+        for dimension in reversed([each for each in entry.iter_children() if each.tag == "DW_TAG_subrange_type"]):
+            length = _number(dimension, "DW_AT_upper_bound") + 1
+            of = {"bytes": length * of["bytes"], "elements": (length, of)}
+        return of
+    if entry.tag not in ("DW_TAG_structure_type", "DW_TAG_union_type"):
+        return {"bytes": _number(entry, "DW_AT_byte_size")}
+    members = []
+    for each in entry.iter_children():
+        if each.tag != "DW_TAG_member":
+            continue
+        of = _described(_target(each))
+        name = each.attributes["DW_AT_name"].value.decode() if "DW_AT_name" in each.attributes else ""
+        bits = _number(each, "DW_AT_bit_size") or 8 * of["bytes"]
+        first = _number(each, "DW_AT_data_bit_offset") or 8 * _number(each, "DW_AT_data_member_location")
+        members.append((first, bits, name, of))
+    return {"bytes": _number(entry, "DW_AT_byte_size"), "members": members}
+
+
+def _member(of: dict[str, Any], bit: int, path: str) -> str:
+    if "elements" in of:
+        _, element = of["elements"]
+        index, rest = divmod(bit, 8 * element["bytes"])
+        return _member(element, rest, f"{path}[{index}]")
+    for first, bits, name, inner in of.get("members", ()):
+        if first <= bit < first + bits:
+            return _member(inner, bit - first, f"{path}.{name}" if path and name else path or name)
+    return f"padding of {path or 'drive_t'}" if "members" in of else path
