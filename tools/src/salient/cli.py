@@ -350,6 +350,9 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="list the groups")
     parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
                         "speed and its loads of its rated torque, as those of the paper's machine")
+    parser.add_argument("--true-machine", type=_option_type("true_machine"), metavar="NAME|FILE",
+                        help="with --machine: the machine of the emulated motor, converter and supply instead; speeds, "
+                        "loads, targets and bounds stay those of --machine")
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: about 20 s")
     parser.add_argument("--out", type=Path, default=OUT / "compare", metavar="DIR",
                         help="folder (default %(default)s)")

@@ -164,6 +164,9 @@ class Conditions:
     """The drive and the conditions under which it runs: the options that a scenario has as well."""
 
     machine: str = _option("saturating", MACHINE, "machine", metavar="NAME|FILE", commands=_CONDITION, argument=False)
+    true_machine: str | None = _option(None, MACHINE, "machine of the emulated motor, converter and supply, where it "
+                                       "differs from that of the firmware, its DBC and the tools", metavar="NAME|FILE",
+                                       commands=("sim", "demo", "run"), argument=False)
     controller: str = _option("salient", WORD, "controller at the start", metavar="NAME", choices=CONTROLLERS,
                               commands=("sim",))
     control_rate_hz: int = _option(40_000, INTEGER, "rate of the control interrupt in Hz", metavar="N",
@@ -185,8 +188,8 @@ class Conditions:
 class BenchConfig(Conditions):
     """A drive and its test bench.
 
-    can: the bus, "auto" until a command or a fixture has chosen one. machine_image: that of `machine`, from the cache
-    unless given. build: a CMake preset, of HOST_BUILDS or
+    can: the bus, "auto" until a command or a fixture has chosen one. machine_image: that of `machine` with
+    the plant of `true_machine`, from the cache unless given. build: a CMake preset, of HOST_BUILDS or
     TARGET_BUILDS or WASM_BUILD. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only;
     instructions gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those
     of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None:

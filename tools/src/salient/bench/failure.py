@@ -77,6 +77,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     simulator = getattr(session, "simulator", None)
     if config is not None:
         about |= {"seed": config.seed, "machine": str(config.machine), "node": config.node}
+        about |= {} if config.true_machine is None else {"true_machine": str(config.true_machine)}
     if simulator is not None:
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes

@@ -71,7 +71,8 @@ def deferred_instructions(instructions: Path) -> Path:
 def command_line(config: BenchConfig) -> list[str]:
     """The command line that starts a test bench. UsageError: as executable() and image(), and options that exclude each
     other."""
-    arguments = replace(config, machine_image=config.machine_image or machine_image(config.machine)).arguments()
+    arguments = replace(config, machine_image=config.machine_image or machine_image(config.machine, config.true_machine)
+                        ).arguments()
     start = str(config.program or executable(config.build))
     if config.build not in TARGET_BUILDS:
         if config.instruction_ns is not None:

@@ -153,13 +153,13 @@ def summary(results: Mapping[str, Any]) -> str:
 
 def _scenarios(options: argparse.Namespace) -> dict[str, list[Scenario]]:
     """Experiment -> one scenario per controller, with the options applied, in terms of the machine."""
-    changes = {name: value for name in ("machine", "control_rate_hz", "encoder_bits", "seed")
+    changes = {name: value for name in ("machine", "true_machine", "control_rate_hz", "encoder_bits", "seed")
                if (value := getattr(options, name)) is not None}
     scenarios = {experiment: [replace(scenario, **changes)
                               for scenario in load_scenarios(SCENARIOS / f"{experiment}.toml")]
                  for experiment in EXPERIMENTS}
     machine = scenarios["start_600"][0].machine
-    command_line(BenchConfig(machine=machine, build=options.build))  # checks the machine
+    command_line(BenchConfig(machine=machine, true_machine=options.true_machine, build=options.build))  # checks them
     path = machine_path(machine)
     scale, conditions = scale_of(load_machine(path)), stated_conditions(path) | changes
     scenarios = {experiment: [scaled(replace(scenario, **conditions), scale) for scenario in of]
@@ -189,8 +189,8 @@ def _run_one(name: str, experiment: str, scenario: Scenario, folder: Path, can: 
     if result.fault != "none":
         raise DemoFailed(f"{name}: the drive ended in fault {result.fault}; see {result.text_log_path}")
     assert result.recording is not None and result.recording_path is not None  # the experiments record
-    machine = load_machine(machine_path(scenario.machine))
-    window_s = steady_window_s(scenario, scale_of(machine))
+    machine = load_machine(machine_path(scenario.plant))
+    window_s = steady_window_s(scenario, scale_of_name(scenario.machine))
     try:
         values = _metrics(experiment, scenario, result.recording, window_s)
         losses = metrics.losses(result.recording, machine, window_s)
@@ -245,6 +245,7 @@ def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
         "encoder": {"bits": scenario.encoder_bits or "ideal", "edges": scenario.encoder_edges},
         "immediate_pwm": scenario.immediate_pwm,
         "machine": Path(scenario.machine).stem,
+        **({} if scenario.true_machine is None else {"true_machine": Path(scenario.true_machine).stem}),
         "torque_sample_step_s": scenario.record.step_us * 1e-6,
         "initial_angle_deg": scenario.initial_angle_deg,
         "seed": scenario.seed,
@@ -283,9 +284,10 @@ def _plot(name: str, path: Path, runs: Sequence[_Run], results: Mapping[str, Any
 def _commands(scenarios: Mapping[str, Sequence[Scenario]], build: str) -> list[str]:
     target = "" if build == "host" else f" --target {build}"
     one = scenarios["start_600"][0]
+    true = "" if one.true_machine is None else f" --true-machine {shlex.quote(one.true_machine)}"
     return [
         "# everything on this page",
-        f"{COMMAND} demo --machine {shlex.quote(one.machine)} --control-rate-hz {one.control_rate_hz}"
+        f"{COMMAND} demo --machine {shlex.quote(one.machine)}{true} --control-rate-hz {one.control_rate_hz}"
         f" --encoder-bits {one.encoder_bits} --seed {one.seed}{target}",
         "# one experiment, with every row of its recordings",
         *(f"{COMMAND} run {experiment}{target}" for experiment in scenarios),

@@ -4,6 +4,7 @@
     controllers = ["traditional", "paper"]  # one run each
     duration_s = 0.4
     load_profile = "compressor_one_cylinder"  # optional: torque over the rotor angle, tools/loads or path of a CSV file
+    true_machine = "mine.toml"              # optional: the emulated machine, where it is not that of the firmware
     seed = 1                                # optional, as everything below; other fields of
     control_rate_hz = 40000                 # salient.config.Conditions likewise, also in [drive] of the machine file
 
@@ -132,6 +133,11 @@ class Scenario(Conditions):
     load_profile: str | None = None
     fault: tuple[FaultStep, ...] = ()
     record: Record | None = None
+
+    @property
+    def plant(self) -> str:
+        """The machine that the emulator has, by name or file."""
+        return self.true_machine or self.machine
 
 
 @dataclass(frozen=True)
@@ -276,7 +282,7 @@ def summary(result: RunResult) -> dict[str, Any]:
         }
     if result.recording is not None and len(result.recording) > 1:
         window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
-        metrics["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.machine)), window_s)
+        metrics["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.plant)), window_s)
     return metrics
 
 
@@ -303,7 +309,7 @@ def check_parameters(scenarios: list[Scenario], build: str) -> None:
         config = _bench_config(scenario, None, build)
         _check_parameter_names(scenario, config)
         values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
-        supply_V = load_machine(machine_path(scenario.machine)).supply_voltage_V
+        supply_V = load_machine(machine_path(scenario.plant)).supply_voltage_V
         check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))
 
 
@@ -404,9 +410,10 @@ def _scenario_file() -> type[Table]:
     bench = create_model("bench", __base__=Table, **variables)
     kinds = get_type_hints(Conditions)
     options: dict[str, Any] = {name: (Annotated[kinds[name], option(name)], DEFAULTS[name])
-                               for name in CONDITIONS if name not in ("machine", "controller")}
+                               for name in CONDITIONS if name not in ("machine", "true_machine", "controller")}
     fields: dict[str, Any] = {
         "machine": (Annotated[str, option("machine")], ...),
+        "true_machine": (Annotated[str | None, option("true_machine")], None),
         "controllers": (list[Annotated[str, one_of(CONTROLLERS)]], ...),
         "duration_s": (Annotated[float, number(1e-3, 3600.0)], ...),
         **options,
@@ -443,9 +450,9 @@ def load_scenarios(path: Path) -> list[Scenario]:
         _check_controllers(file.controllers)
     except TextFileError as error:
         raise UsageError(f"{path}: {error}") from None
-    relative = path.parent / file.machine
-    machine = str(relative.resolve()) if relative.suffix == ".toml" else file.machine
-    machine_image(machine)  # checks it
+    machine = _machine_of(path, file.machine)
+    true_machine = None if file.true_machine is None else _machine_of(path, file.true_machine)
+    machine_image(machine, true_machine)  # checks them
     for step in file.speed:
         _check_reference(path, machine, "DRIVE_COMMAND.speed_reference_rpm", "speed.value_rpm", step.value_rpm)
     for step in file.torque:
@@ -456,6 +463,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
     common |= {
         "name": path.stem,
         "machine": machine,
+        "true_machine": true_machine,
         "duration_s": file.duration_s,
         "parameters": file.parameters,
         "bench": {name: getattr(file.bench, name) for name in data.get("bench", {})},  # set in the order of the file
@@ -472,6 +480,12 @@ def load_scenarios(path: Path) -> list[Scenario]:
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
     return scenarios
+
+
+def _machine_of(path: Path, name: str) -> str:
+    """Name or path of a machine of a scenario file."""
+    relative = path.parent / name
+    return str(relative.resolve()) if relative.suffix == ".toml" else name
 
 
 def _load_profile_of(path: Path, name: str) -> str:

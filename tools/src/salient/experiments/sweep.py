@@ -145,9 +145,11 @@ def _scenario(base: Scenario, columns: Mapping[str, Any]) -> Scenario:
 def _key(of: Run) -> str:
     """Identifies the executable, the machine's image, the code of the metrics, and the scenario."""
     profile = of.scenario.load_profile
-    files = [machine_image(of.scenario.machine), Path(__file__), Path(str(run_metrics.__file__)),
+    files = [machine_image(of.scenario.machine, of.scenario.true_machine), Path(__file__),
+             Path(str(run_metrics.__file__)),
              *([load_profile_path(profile)] if profile else [])]
-    scenario = replace(of.scenario, machine=Path(of.scenario.machine).stem)
+    scenario = replace(of.scenario, machine=Path(of.scenario.machine).stem,
+                       true_machine=of.scenario.true_machine and Path(of.scenario.true_machine).stem)
     return hashlib.sha256(" ".join([of.program, *map(tasks.file_digest, files), repr(scenario)]).encode()).hexdigest()
 
 
@@ -182,7 +184,7 @@ def _metrics(result: RunResult) -> dict[str, Any]:
                            "lowest_torque_Nm": low_Nm, "mean_torque_Nm": mean_Nm}
     if mean_Nm > 0.0 and scenario.record is not None and scenario.record.step_us <= 1.0:  # else it would be hidden
         row["torque_ripple"] = (high_Nm - low_Nm) / mean_Nm
-    energy = losses(recording, load_machine(machine_path(scenario.machine)), (float(window["time_s"][0]), last_s))
+    energy = losses(recording, load_machine(machine_path(scenario.plant)), (float(window["time_s"][0]), last_s))
     row |= {name: energy[name] for name in ("phase_current_rms_A", "efficiency_percent")}
     if scenario.speed and not scenario.torque:
         first, last = scenario.speed[0], scenario.speed[-1]

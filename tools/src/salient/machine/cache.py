@@ -27,10 +27,14 @@ IMAGE_SUFFIX = ".machine"
 TABLES_SUFFIX, PLANT_SUFFIX = ".tables.c", ".plant.c"
 
 
-def machine_image(name_or_path: str) -> Path:
-    """The image of a bundled machine or a machine file. UsageError: a mistake in the file, one line that names it."""
+def machine_image(name_or_path: str, true_machine: str | None = None) -> Path:
+    """The image of a bundled machine or a machine file; with a true machine its firmware's tables beside the plant of
+    that one (salient.machine.pair). UsageError: a mistake in a file, or two that do not fit; one line that names it."""
     try:
-        return files_by_content(machine_path(name_or_path))[0]
+        path = machine_path(name_or_path)
+        if true_machine is None:
+            return files_by_content(path)[0]
+        return _image_of_pair(path, machine_path(true_machine))
     except MachineError as error:
         raise UsageError(str(error)) from None
 
@@ -47,6 +51,22 @@ def files_by_content(path: Path, suffixes: Sequence[str] = (IMAGE_SUFFIX,)) -> l
         if content_key(path) == key:  # else the file was changed meanwhile
             for suffix, content in made.items():
                 _write(FOLDER / f"{key}{suffix}", content)
+
+
+def _image_of_pair(path: Path, true_path: Path) -> Path:
+    """MachineError: the machines do not fit together, or a mistake in a file."""
+    while True:
+        image, _ = files_by_content(path)[0], files_by_content(true_path)  # checks both
+        keys = (content_key(path), content_key(true_path))
+        kept = FOLDER / f"{hashlib.sha256(' '.join(keys).encode()).hexdigest()[:32]}{IMAGE_SUFFIX}"
+        if kept.exists():
+            return kept
+        from salient.machine.pair import image_of_pair  # NumPy and pydantic, as in _make
+
+        made = image_of_pair(image.read_bytes(), path, true_path)
+        if image.stem == keys[0] and keys == (content_key(path), content_key(true_path)):  # else one changed meanwhile
+            _write(kept, made)
+            return kept
 
 
 def _make(path: Path) -> Mapping[str, bytes]:
@@ -94,7 +114,7 @@ def bench_config(given: Mapping[str, Any]) -> BenchConfig:
     else the defaults. UsageError: no such option; as machine_image."""
     check_options(given)
     machine = given.get("machine", DEFAULTS["machine"])
-    image = given.get("machine_image") or machine_image(machine)  # checks the file
+    image = given.get("machine_image") or machine_image(machine, given.get("true_machine"))  # checks the file
     return BenchConfig(**{**stated_conditions(machine_path(machine)), **given, "machine_image": image})
 
 

@@ -283,5 +283,10 @@ def image(machine: Machine, scaling: Scaling, tables: FirmwareTables) -> bytes:
         FLUX_MAP.packed(machine.magnetics) if isinstance(machine.magnetics, FluxMap) else b"",
         machine.name.encode("ascii") + b"\0",
     ]
+    return joined(parts)
+
+
+def joined(parts: list[bytes]) -> bytes:
+    """The image of its four packed parts: header, lengths, checksum."""
     checked = HEADER.pack(b"", 0, 0, *map(len, parts))[_CHECKED_FROM:] + b"".join(parts)
     return MAGIC + struct.pack("<II", LAYOUT, zlib.crc32(checked)) + checked

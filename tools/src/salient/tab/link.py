@@ -35,6 +35,7 @@ def link_of(bench: Bench) -> str | None:
     if (IS_WHEEL or options.program is not None or options.build != "host"
             or options.drives != 1 or not bench.address.startswith("unix:")
             or machine_path(options.machine).parent != MACHINES or machine_path(options.machine).suffix != ".toml"
+            or options.true_machine is not None
             or any(getattr(options, name) != DEFAULTS[name] for name in _ONLY_ALONE)
             or not all(_is_classic(message) for _, message in bench.sent) or _others_sent(bench)):
         return None

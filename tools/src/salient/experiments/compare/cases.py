@@ -330,7 +330,8 @@ def scenario_toml(case: Case) -> str:
     plain = Scenario(name="", duration_s=0.0)
     tables: list[tuple[str, Mapping[str, float]]] = []
     for key, value in vars(scenario).items():
-        if key in ("name", "machine", "controller") or (key not in CONDITIONS and value == getattr(plain, key)):
+        if key in ("name", "machine", "controller") or value is None or (
+                key not in CONDITIONS and value == getattr(plain, key)):
             continue  # what is left out of the conditions would be that of the machine file
         if isinstance(value, Mapping):
             tables.append((f"[{key}]", value))

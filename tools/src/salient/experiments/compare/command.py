@@ -20,6 +20,7 @@ from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
 from salient.experiments.scenario import check_parameters
 from salient.experiments.settings import parse_values, with_setting
+from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 from salient.paths import COMMAND, make_folder
 
@@ -39,6 +40,8 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         on = _subject(options.machine)
         cases, titles = cases_of(cases, on, options.quick), {name: on.text(title) for name, title in titles.items()}
         targets = TARGETS if on.is_bundled else targets_of(on)
+    if options.true_machine is not None:
+        cases = _with_true_machine(cases, options.machine, options.true_machine)
     cases = _with_settings(_first_samples(cases, options.samples), options.set)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
     make_folder(options.out, (f"{FAILED}/*.toml", results_file.NAME, PAGE, summary_file.NAME))
@@ -82,6 +85,14 @@ def _subject(name_or_path: str) -> Subject:
         return subject(name_or_path)
     except MachineError as error:
         raise UsageError(str(error)) from None
+
+
+def _with_true_machine(cases: Sequence[Case], machine: str | None, true_machine: str) -> list[Case]:
+    """The cases with another machine in the emulator. UsageError: without --machine, or the two do not fit."""
+    if machine is None:
+        raise UsageError(f"--true-machine {true_machine}: only with --machine, whose drive it replaces the motor of")
+    machine_image(machine, true_machine)  # checks them
+    return [replace(case, scenario=replace(case.scenario, true_machine=true_machine)) for case in cases]
 
 
 def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
@@ -132,6 +143,8 @@ def _file_name(case: Case) -> str:
 
 def _command(options: argparse.Namespace) -> str:
     machine = [] if options.machine is None else ["--machine", shlex.quote(options.machine)]
+    if options.true_machine is not None:
+        machine += ["--true-machine", shlex.quote(options.true_machine)]
     return " ".join([f"{COMMAND} compare", *options.groups, *machine, *(["--quick"] if options.quick else []),
                      *(["--set " + shlex.quote(text) for text in options.set]),
                      *([f"--samples {options.samples}"] if options.samples else [])])

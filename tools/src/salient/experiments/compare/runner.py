@@ -50,8 +50,9 @@ def run_all(cases: Sequence[Case], jobs: int | None, stream: TextIO, out: Path, 
     A run that ends in a fault, or whose metrics cannot be computed, is marked as failed. out, afresh, scheduler, jobs:
     see tasks.run. UsageError for parameters that the drive does not have.
     """
-    images = {machine: machine_image(machine) for machine in {case.scenario.machine for case in cases}}
-    keys = [_key(case, images[case.scenario.machine]) for case in cases]
+    pairs = {(case.scenario.machine, case.scenario.true_machine) for case in cases}
+    images = {pair: machine_image(*pair) for pair in pairs}
+    keys = [_key(case, images[case.scenario.machine, case.scenario.true_machine]) for case in cases]
     by_key = dict(zip(keys, cases, strict=True))
     listed = [tasks.Task(key, (case, _programs_digest(case))) for key, case in by_key.items()]
     results: dict[str, tuple[Metrics, str, Any]] = {}
