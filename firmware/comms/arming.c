@@ -10,6 +10,15 @@ void arming_init(arming_t *arming) {
     *arming = (arming_t){.changed = true}; /* a sender may take the drive for armed still */
 }
 
+/* Parts of arming_t.check: of one flipped bit neither becomes the other value. */
+#define CHECK_ARMED 0x00ffu
+#define CHECK_CONFIGURING 0xff00u
+
+/* Both are what they were set to. */
+static bool is_intact(const arming_t *arming) {
+    return arming->check == ((arming->armed ? CHECK_ARMED : 0u) | (arming->configuring ? CHECK_CONFIGURING : 0u));
+}
+
 static void end_attempt(arming_t *arming) {
     arming->changed |= arming->attempt != ARMING_ATTEMPT_NONE;
     arming->attempt = ARMING_ATTEMPT_NONE;
@@ -17,6 +26,10 @@ static void end_attempt(arming_t *arming) {
 }
 
 COLD void arming_check_timeout(arming_t *arming, uint32_t time_us) {
+    if (!is_intact(arming)) {
+        arming_disarm(arming);
+        arming_end_configuration(arming);
+    }
     const uint32_t age_us = time_us - arming->challenge_us;
     if (age_us > ARMING_RESPONSE_MAX_US) {
         end_attempt(arming);
@@ -35,11 +48,13 @@ COLD void arming_disarm(arming_t *arming) {
     }
     arming->changed |= arming->armed;
     arming->armed = false;
+    arming->check &= (uint16_t)~CHECK_ARMED;
 }
 
 COLD void arming_end_configuration(arming_t *arming) {
     arming->changed |= arming->configuring;
     arming->configuring = false;
+    arming->check &= (uint16_t)~CHECK_CONFIGURING;
 }
 
 COLD arming_result_t arming_refuse(arming_t *arming) {
@@ -76,9 +91,11 @@ static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool 
     arming->drawn = false;
     if (attempt == ARMING_ATTEMPT_RUN) {
         arming->armed = true;
+        arming->check |= CHECK_ARMED;
         return ARMING_ARMED;
     }
     arming->configuring = true;
+    arming->check |= CHECK_CONFIGURING;
     arming->configuring_us = time_us;
     return ARMING_CONFIGURING;
 }

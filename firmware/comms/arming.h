@@ -43,6 +43,7 @@ typedef struct {
     uint32_t challenge_us;   /* when it was drawn */
     uint32_t configuring_us; /* time of the confirmation or of the last valid frame of the set */
     uint16_t refused;        /* frames, since start; saturates at 65535 */
+    uint16_t check;          /* of armed and configuring, follows each change of them */
 } arming_t;
 
 typedef enum { ARMING_REFUSED, ARMING_CHALLENGED, ARMING_ARMED, ARMING_CONFIGURING } arming_result_t;
@@ -50,8 +51,8 @@ typedef enum { ARMING_REFUSED, ARMING_CHALLENGED, ARMING_ARMED, ARMING_CONFIGURI
 /* Not armed, which is to be reported. */
 void arming_init(arming_t *arming);
 
-/* Ends an attempt whose response is overdue, and a configuration without frames. Call it at least once in 35 minutes.
- * [background] */
+/* Ends an attempt whose response is overdue, and a configuration without frames; and both armings when one of them has
+ * changed in memory. Call it before a frame is received, and at least once in 35 minutes. [background] */
 void arming_check_timeout(arming_t *arming, uint32_t time_us);
 
 /* Takes a DRIVE_ARM of the right length and checksum: draws a challenge, or arms. permitted: the drive may be armed

@@ -205,6 +205,14 @@ COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
     }
 }
 
+/* False when a run goes on, or is about to begin, by a command that the bus has not brought: one of both copies has
+ * changed. The last one before a bus-off is not taken, and lets the one before age. */
+COLD static bool is_commanded(const drive_t *drive) {
+    const command_request_t received = drive->comms.command.request;
+    return drive->command.request != COMMAND_RUN || received == COMMAND_RUN || received == COMMAND_STOP ||
+           drive->comms.bus.run_inhibited;
+}
+
 /* A latch that has changed is not to be trusted: the drive is in fault from here on, and of a run that this has ended
  * nothing is left. */
 COLD static void test_itself(drive_t *drive, uint32_t time_us) {
@@ -212,7 +220,7 @@ COLD static void test_itself(drive_t *drive, uint32_t time_us) {
     state_machine_t *state_machine = &drive->control.state_machine;
     self_test_step(test, drive->hal, &drive->control_parameters, &drive->parameters, time_us);
     hal_critical_enter(drive->hal);
-    if (!self_test_latch_intact(&drive->control)) {
+    if (!self_test_latch_intact(&drive->control) || !is_commanded(drive)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
         drive->control.torque_reference_q24 = 0;
         control_prepare(&drive->control_parameters, &drive->control);

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from salient.errors import UsageError
 from salient.experiments.scenario import load_scenarios, run_all
 from salient.machine.cache import machine_image

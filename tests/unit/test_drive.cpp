@@ -513,6 +513,35 @@ TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_next_background_on) {
+    periods(100);
+    send(COMMAND_OFF);
+    hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+    periods(10);
+    hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    periods(10);
+    ASSERT_TRUE(drive.comms.commands.arming.armed);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    drive.command.request = COMMAND_RUN; // as by a flipped bit
+    periods(1);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
+    EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
+    periods(1);
+    EXPECT_TRUE(hal.open);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF) << "withdrawn";
+}
+
+TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    drive.comms.command.request = COMMAND_OFF; // as by a flipped bit
+    periods(2);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
+    EXPECT_TRUE(hal.open);
+}
+
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);
     command(COMMAND_RUN);

@@ -436,6 +436,37 @@ TEST_F(Commands, a_damaged_arming_frame_is_counted_and_changes_nothing) {
     EXPECT_EQ(commands.arming.refused, 256 - ARMING_STEP_COUNT);
 }
 
+TEST_F(Commands, a_bit_that_flips_in_what_arms_neither_arms_nor_leaves_armed) {
+    for (const bool armed : {false, true}) {
+        for (bool *each : {&commands.arming.armed, &commands.arming.configuring}) {
+            for (unsigned bit = 0; bit < 8; bit++) {
+                commands_init(&commands);
+                if (armed) {
+                    arm(1, 10000);
+                }
+                uint8_t byte;
+                memcpy(&byte, each, 1);
+                byte = uint8_t(byte ^ 1u << bit);
+                memcpy(each, &byte, 1);
+                supervise(DRIVE_STATE_READY, 11000);
+                EXPECT_FALSE(commands.arming.configuring) << armed << bit;
+                EXPECT_FALSE(commands.arming.armed && (!armed || byte == 0)) << armed << bit;
+                EXPECT_TRUE(commands.arming.changed || armed) << "is told";
+            }
+        }
+    }
+}
+
+TEST_F(Commands, a_bit_that_flips_in_the_check_of_the_arming_disarms) {
+    for (unsigned bit = 0; bit < 16; bit++) {
+        commands_init(&commands);
+        arm(1, 10000);
+        commands.arming.check = uint16_t(commands.arming.check ^ 1u << bit);
+        supervise(DRIVE_STATE_READY, 11000);
+        EXPECT_FALSE(commands.arming.armed) << bit;
+    }
+}
+
 TEST_F(Commands, what_disarms) {
     const auto disarms = [&](const auto &event) {
         commands_init(&commands);

@@ -91,7 +91,8 @@ def hazards(flip: Result, without: Result) -> list[tuple[str, int]]:
 
 
 def serve(task: tuple[str, int, int, int, int, int, str]) -> Result:
-    """Counts of the classes of a chunk of bits, and its flips that are none of none, within and fault. For workers."""
+    """Counts of the classes of a chunk of bits, and its flips of other classes than none, within and fault. For worker
+    processes."""
     part, controller, state, first, number, stride, expected = task
     check_build(digest(), expected)
     without, *changed = flips(controller, state, first, number, stride)
@@ -144,7 +145,9 @@ def summary(results: Iterable[Result], layout: Layout, stride: int, seed: int) -
         for flip in result["found"]:
             member = re.sub(r"\[\d+\]", "[]", layout.member(flip["bit"]))
             members[flip["class"]][f"{member}: {', '.join(flip['rules']) or combination}"] += 1
+    every = [counts for found in classes.values() for counts in found.values()]
     return {"commit": commit(), "stride": stride, "seed": seed, "bits": 8 * layout.size,
+            "flips": sum(counts.total() for counts in every), "unsafe": sum(counts["unsafe"] for counts in every),
             "classes": {part: {name: {of: counts[of] for of in CLASSES} for name, counts in sorted(found.items())}
                         for part, found in classes.items()},
             "causes": dict(causes.most_common()),
