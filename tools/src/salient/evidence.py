@@ -206,7 +206,7 @@ def run(out: Path, only: Sequence[str], *, rerun: bool) -> int:
     unknown = sorted(set(only) - {claim.name for claim in claims})
     if unknown:
         raise UsageError(f"unknown claim '{unknown[0]}': {', '.join(claim.name for claim in claims)}")
-    chosen = [claim for claim in claims if not only or claim.name in only]
+    chosen = [claim for name in only for claim in claims if claim.name == name] or claims
     if rerun:
         for claim in chosen:
             if judge(claim, ROOT).state in RED:
