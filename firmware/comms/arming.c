@@ -46,14 +46,14 @@ COLD void arming_disarm(arming_t *arming) {
     if (arming->attempt == ARMING_ATTEMPT_RUN) {
         end_attempt(arming);
     }
-    arming->changed |= arming->armed;
-    arming->armed = false;
+    arming->changed |= arming->armed != 0;
+    arming->armed = 0;
     arming->check &= (uint16_t)~CHECK_ARMED;
 }
 
 COLD void arming_end_configuration(arming_t *arming) {
-    arming->changed |= arming->configuring;
-    arming->configuring = false;
+    arming->changed |= arming->configuring != 0;
+    arming->configuring = 0;
     arming->check &= (uint16_t)~CHECK_CONFIGURING;
 }
 
@@ -90,11 +90,11 @@ static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool 
     arming->changed = true;
     arming->drawn = false;
     if (attempt == ARMING_ATTEMPT_RUN) {
-        arming->armed = true;
+        arming->armed = 1;
         arming->check |= CHECK_ARMED;
         return ARMING_ARMED;
     }
-    arming->configuring = true;
+    arming->configuring = 1;
     arming->check |= CHECK_CONFIGURING;
     arming->configuring_us = time_us;
     return ARMING_CONFIGURING;
@@ -123,8 +123,8 @@ COLD void arming_report(const arming_t *arming, uint16_t run_unarmed, hal_can_fr
     const struct drive_arming_t message = {
         .challenge = arming->challenge,
         .attempt = (uint8_t)arming->attempt,
-        .armed = arming->armed,
-        .configuring = arming->configuring,
+        .armed = arming->armed != 0,
+        .configuring = arming->configuring != 0,
         .refused = (uint8_t)(arming->refused < UINT8_MAX ? arming->refused : UINT8_MAX),
         .run_unarmed = run_unarmed,
     };

@@ -33,11 +33,12 @@
 
 /* All zero is not armed. */
 typedef struct {
-    bool armed;       /* a command to run is accepted */
-    bool configuring; /* a set of parameters is accepted */
-    bool changed;     /* DRIVE_ARMING is to be sent */
-    bool drawn;       /* the last challenge was drawn less than ARMING_INTERVAL_US ago, and has no correct response */
-    uint8_t counter;  /* of step 1 */
+    /* 0 or not; no bool, of which a byte that has changed in memory has no defined value: */
+    uint8_t armed;       /* a command to run is accepted */
+    uint8_t configuring; /* a set of parameters is accepted */
+    bool changed;        /* DRIVE_ARMING is to be sent */
+    bool drawn;      /* the last challenge was drawn less than ARMING_INTERVAL_US ago, and has no correct response */
+    uint8_t counter; /* of step 1 */
     arming_attempt_t attempt;
     uint32_t challenge;      /* of the attempt; 0 without one */
     uint32_t challenge_us;   /* when it was drawn */

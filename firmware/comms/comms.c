@@ -73,7 +73,7 @@ static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *paramet
     }
     hal_can_frame_t response;
     if (frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID) {
-        if (parameter_set_control(&comms->set, arming->configuring, parameters, comms->store, conditions, frame,
+        if (parameter_set_control(&comms->set, arming->configuring != 0, parameters, comms->store, conditions, frame,
                                   &response)) {
             arming_end_configuration(arming);
         }

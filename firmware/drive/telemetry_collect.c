@@ -162,8 +162,8 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     const arming_t *arming = &drive->comms.commands.arming;
     telemetry->arming.challenge = arming->challenge;
     telemetry->arming.attempt = arming->attempt;
-    telemetry->arming.armed = arming->armed;
-    telemetry->arming.configuring = arming->configuring;
+    telemetry->arming.armed = arming->armed != 0;
+    telemetry->arming.configuring = arming->configuring != 0;
     telemetry->arming.refused = arming->refused;
     telemetry->arming.run_unarmed = counters->run_unarmed;
 

@@ -438,16 +438,14 @@ TEST_F(Commands, a_damaged_arming_frame_is_counted_and_changes_nothing) {
 
 TEST_F(Commands, a_bit_that_flips_in_what_arms_neither_arms_nor_leaves_armed) {
     for (const bool armed : {false, true}) {
-        for (bool *each : {&commands.arming.armed, &commands.arming.configuring}) {
+        for (uint8_t *each : {&commands.arming.armed, &commands.arming.configuring}) {
             for (unsigned bit = 0; bit < 8; bit++) {
                 commands_init(&commands);
                 if (armed) {
                     arm(1, 10000);
                 }
-                uint8_t byte;
-                memcpy(&byte, each, 1);
-                byte = uint8_t(byte ^ 1u << bit);
-                memcpy(each, &byte, 1);
+                *each = uint8_t(*each ^ 1u << bit);
+                const uint8_t byte = *each;
                 supervise(DRIVE_STATE_READY, 11000);
                 EXPECT_FALSE(commands.arming.configuring) << armed << bit;
                 EXPECT_FALSE(commands.arming.armed && (!armed || byte == 0)) << armed << bit;
