@@ -32,6 +32,7 @@ PAGES = {
         "test": "tests/drive/test_kinds.py::test_timeout[linear_cosine-paper]", "phase": "call",
         "replay_in": "/home/user", "error": ">       bench.run_until(lambda: False, timeout=0.06)",
         "machine": "linear_cosine", "seed": 1, "virtual_time_s": 0.09, "plots": [PLOT], "stderr": "",
+        "drive": "tripped: encoder, reported at 0.201552 s, 1.552 ms after fault encoder_stuck begins",
         "last_stimulus": "0.250000 s run in speed mode, speed_reference_rpm = 0 r/min, 1.316 ms before the failure",
         "stimuli": ["0.250000 s run in speed mode, speed_reference_rpm = 0 r/min"],
         "changes_before_the_failure": ["0.251316 s DRIVE_MOTION.speed_reference_rpm: 300 r/min -> 0 r/min"],

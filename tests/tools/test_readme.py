@@ -27,6 +27,7 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs
 # The suite itself, and every experiment with its report (tests/tools/test_demo.py).
 NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b", re.MULTILINE)
 
+STARTS_A_DRIVE = re.compile(r"^tools/salient sim\b", re.MULTILINE)
 SELECTIONS = ((re.compile(r"(\bctest [^&|\n]*)"), r"\1 -N | grep 'Total Tests: [1-9]'"),
               (re.compile(r"(\bbuild/venv/bin/pytest [^&|\n]*)"), r"\1 --collect-only"))
 
@@ -39,7 +40,8 @@ def listed(block: str) -> str:
 
 
 def sections(path: Path) -> list[tuple[str, list[str]]]:
-    """(title, blocks marked `sh`) of each section that has any."""
+    """(title, blocks marked `sh`) of each section that has any. One that uses the bus of a drive which an earlier
+    section of the page has started begins with that start."""
     found: list[tuple[str, list[str]]] = [(path.name, [])]
     fence: str | None = None
     for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
@@ -51,6 +53,12 @@ def sections(path: Path) -> list[tuple[str, list[str]]]:
             found[-1][1][-1] += line
         elif fence is None and line.startswith("#"):
             found.append((line.strip("# \n"), []))
+    start: list[str] = []
+    for _, blocks in found:
+        own = [block for block in blocks if STARTS_A_DRIVE.search(block)]
+        if not own and any(BUS in block for block in blocks):
+            blocks[:0] = start
+        start = own[-1:] or start
     return [(title, blocks) for title, blocks in found if blocks]
 
 
@@ -85,7 +93,7 @@ def test_commands_of_a_section_succeed(tmp_path: Path, blocks: list[str]) -> Non
         for block in blocks:
             assert not NOT_TO_BE_RUN.search(block), f"mark it `sh untested`:\n{block}"
             shell = ["bash", "-euo", "pipefail", "-c", listed(block).replace(BUS, f"{tmp_path}/salient.sock")]
-            if re.search(r"^tools/salient sim\b", block, re.MULTILINE):
+            if STARTS_A_DRIVE.search(block):
                 simulator = subprocess.Popen(shell, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                              text=True, start_new_session=True)
                 simulators.append(simulator)
