@@ -42,8 +42,7 @@ class ParameterSet : public testing::Test {
     uint32_t write(unsigned index, int32_t value) {
         const hal_can_frame_t frame = frames::parameter_write(++counter, index, value);
         parameter_set_write(&set, &frame);
-        return check =
-                   crc32_continue(check, frame.data + E2E_HEADER_BYTES, unsigned(frame.length - E2E_HEADER_BYTES));
+        return check = crc32_continue(check, frame.data + E2E_HEADER_BYTES, unsigned(frame.length - E2E_HEADER_BYTES));
     }
 
     int32_t value(unsigned index) const { return drive.parameters.values[index]; }

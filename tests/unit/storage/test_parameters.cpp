@@ -96,10 +96,14 @@ TEST_F(StoredParameters, thresholds_that_the_present_supply_would_fail_are_refus
         int32_t supply, under, over;
         unsigned refused; // PARAMETER_COUNT: not
     } cases[] = {
-        {under, under + 1, over, PARAMETER_UNDER_VOLTAGE_V}, {under, under, over, PARAMETER_COUNT},
-        {under - 1, under + 1, over, PARAMETER_COUNT},       {over, under, over - 1, PARAMETER_OVER_VOLTAGE_V},
-        {over, under, over, PARAMETER_COUNT},                {over + 1, under, over - 1, PARAMETER_COUNT},
-        {0, under + 1, over - 1, PARAMETER_COUNT},           {under + 1, under + 1, over, PARAMETER_COUNT},
+        {under, under + 1, over, PARAMETER_UNDER_VOLTAGE_V},
+        {under, under, over, PARAMETER_COUNT},
+        {under - 1, under + 1, over, PARAMETER_COUNT},
+        {over, under, over - 1, PARAMETER_OVER_VOLTAGE_V},
+        {over, under, over, PARAMETER_COUNT},
+        {over + 1, under, over - 1, PARAMETER_COUNT},
+        {0, under + 1, over - 1, PARAMETER_COUNT},
+        {under + 1, under + 1, over, PARAMETER_COUNT},
         {over - 1, under, over - 1, PARAMETER_COUNT},
     };
     for (const auto &one : cases) {
