@@ -13,6 +13,7 @@
 
 extern "C" {
 #include "comms/e2e.h"
+#include "comms/node.h"
 #include "drive/drive.h"
 #include "drive_codec.h"
 #include "hal_adc.h"
@@ -338,6 +339,49 @@ TEST_F(Drive, refuses_a_rate_that_the_timer_cannot_make_and_starts_nothing) {
         EXPECT_FALSE(drive_init(&refused, &other, &config));
         EXPECT_TRUE(other.starts.empty());
         EXPECT_EQ(other.writes, 0u);
+    }
+}
+
+TEST_F(Drive, has_one_of_eight_nodes_and_no_other) {
+    for (const unsigned node : {0u, 1u, NODE_MAX, NODE_MAX + 1, 255u}) {
+        hal_t other;
+        drive_t started;
+        const drive_config_t config = {
+            .control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL, .node = uint8_t(node)};
+        EXPECT_EQ(drive_init(&started, &other, &config), node < 8) << node;
+        EXPECT_EQ(other.starts.size(), node < 8 ? 1u : 0u) << node;
+    }
+}
+
+TEST_F(Drive, lines_of_the_torque_off_that_differ_for_200_ms_are_a_failed_check_and_before_they_are_none) {
+    periods(100);
+    hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_STO_2;
+    periods(7900); // 197.5 ms
+    EXPECT_EQ(drive.control.reported_fault_mask & FAULT_BIT(FAULT_STO_DISCREPANCY), 0u);
+    periods(200);
+    EXPECT_EQ(drive.control.reported_fault_mask & FAULT_BIT(FAULT_STO_DISCREPANCY), FAULT_BIT(FAULT_STO_DISCREPANCY));
+}
+
+TEST_F(Drive,
+       what_a_run_has_learned_of_the_phases_is_of_those_that_the_machine_has_and_no_misalignment_is_left_after_it) {
+    hal.open = true;
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const table_scale_phase_t none{};
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        const bool untouched = std::memcmp(&drive.table_scale.phase[phase], &none, sizeof none) == 0;
+        EXPECT_EQ(untouched, phase >= machine_tables.phases) << phase;
+        drive.control.flux_misalignment[phase] = 12345;
+    }
+    send(COMMAND_OFF);
+    periods(100);
+    ASSERT_NE(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+        EXPECT_EQ(drive.control.flux_misalignment[phase], 0) << phase;
     }
 }
 

@@ -6,6 +6,7 @@
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "comms/arming.h"
 #include "comms/commands.h"
 #include "comms/counter.h"
 #include "drive_codec.h"
@@ -463,6 +464,22 @@ TEST_F(Commands, a_bit_that_flips_in_the_check_of_the_arming_disarms) {
         supervise(DRIVE_STATE_READY, 11000);
         EXPECT_FALSE(commands.arming.armed) << bit;
     }
+}
+
+TEST_F(Commands, an_arming_for_configuration_that_ends_is_reported_and_one_that_there_is_not_does_not_end) {
+    commands.arming.changed = false;
+    arming_end_configuration(&commands.arming);
+    EXPECT_FALSE(commands.arming.changed);
+    take(frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION), DRIVE_STATE_READY, 2000);
+    take(frames::arm(8, ARMING_STEP_CONFIRM_CONFIGURATION, ~commands.arming.challenge), DRIVE_STATE_READY, 3000);
+    ASSERT_TRUE(commands.arming.configuring);
+    commands.arming.changed = false;
+    supervise(DRIVE_STATE_READY, 3000 + ARMING_CONFIGURATION_US);
+    EXPECT_TRUE(commands.arming.configuring);
+    EXPECT_FALSE(commands.arming.changed);
+    supervise(DRIVE_STATE_READY, 3001 + ARMING_CONFIGURATION_US);
+    EXPECT_FALSE(commands.arming.configuring);
+    EXPECT_TRUE(commands.arming.changed);
 }
 
 TEST_F(Commands, what_disarms) {

@@ -129,6 +129,17 @@ TEST_F(MemoryProtocol, reads_every_part_of_a_logged_fault_in_the_units_of_the_bu
     }
 }
 
+TEST_F(MemoryProtocol, the_current_of_a_logged_fault_is_the_largest_of_all_phases) {
+    for (unsigned largest = 0; largest < HAL_PHASES_MAX; largest++) {
+        fault_record_t record = fault_of(largest + 1);
+        for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+            record.current_q9[phase] = uint16_t(phase == largest ? 30000 : 100 + phase);
+        }
+        write(record);
+        EXPECT_EQ(value_of(PARAMETER_OPERATION_FAULT_LOG, 8, int32_t(largest) + 1), 30000) << largest;
+    }
+}
+
 TEST_F(MemoryProtocol, reads_the_last_16_faults_by_their_number_and_no_other) {
     for (uint32_t number = 1; number <= 20; number++) {
         write(fault_of(number));

@@ -9,6 +9,7 @@ extern "C" {
 #include "comms/parameter_protocol.h"
 #include "control/machine_tables.h"
 #include "drive_codec.h"
+#include "storage/parameters.h"
 }
 #include "support/frames.h"
 
@@ -150,8 +151,9 @@ TEST_F(Parameters, protocol_reads_everything_of_every_row) {
 TEST_F(Parameters, protocol_never_reads_past_a_text) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         for (unsigned part = 0; part < 256; part++) {
-            const size_t length = TEXTS[i].name.size();
-            EXPECT_EQ(request(PARAMETER_OPERATION_NAME, i, part).value != 0, part * 4 < length)
+            EXPECT_EQ(request(PARAMETER_OPERATION_NAME, i, part).value != 0, part * 4 < TEXTS[i].name.size())
+                << i << " part " << part;
+            EXPECT_EQ(request(PARAMETER_OPERATION_UNIT, i, part).value != 0, part * 4 < TEXTS[i].unit.size())
                 << i << " part " << part;
         }
     }

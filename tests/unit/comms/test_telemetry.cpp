@@ -314,6 +314,71 @@ TEST_F(Comms, a_fault_is_reported_with_the_next_cycle_and_every_100_ms) {
     EXPECT_EQ(bus.count(DRIVE_FAULT_CAUSE_FRAME_ID), 4u);
 }
 
+TEST_F(Comms, loads_of_windings_and_switches_are_hundredths_of_a_percent_of_the_hottest) {
+    for (const auto &[load, expected] :
+         {std::pair{0.0, 0u}, std::pair{0.25, 2500u}, std::pair{1.0, 10000u}, std::pair{63.0, 630000u}}) {
+        drive.thermal = {};
+        drive.thermal.winding_q56[2] = int64_t(load * 0x1p56);
+        drive.thermal.switches_q56[1] = int64_t(load * 0x1p55);
+        drive_telemetry_t values;
+        telemetry_collect(&drive, 0, &values);
+        EXPECT_EQ(values.thermal.winding_load, expected);
+        EXPECT_EQ(values.thermal.switch_load, expected / 2);
+    }
+}
+
+TEST_F(Comms, a_lost_phase_is_named_with_the_torque_that_is_left_and_without_one_there_is_nothing) {
+    for (unsigned phase = 0; phase < 5; phase++) {
+        drive.degraded = {};
+        drive.degraded.lost = phase < 4 ? 1u << phase : 0u;
+        drive.degraded.mean_q24 = 6 << 24;
+        drive.degraded.least_q24 = -(2 << 24);
+        drive_telemetry_t values;
+        telemetry_collect(&drive, 0, &values);
+        const bool lost = phase < 4;
+        EXPECT_EQ(values.degraded.degraded, lost);
+        EXPECT_EQ(values.degraded.lost_phase_a, phase == 0);
+        EXPECT_EQ(values.degraded.lost_phase_b, phase == 1);
+        EXPECT_EQ(values.degraded.lost_phase_c, phase == 2);
+        EXPECT_EQ(values.degraded.lost_phase_d, phase == 3);
+        EXPECT_EQ(values.degraded.torque_mean_nm, lost ? 6 * 256 : 0);
+        EXPECT_EQ(values.degraded.torque_least_nm, lost ? -2 * 256 : 0);
+        drive.degraded.mean_q24 = 0; // the sum is not complete
+        telemetry_collect(&drive, 0, &values);
+        EXPECT_EQ(values.degraded.torque_mean_nm, 0);
+        EXPECT_EQ(values.degraded.torque_least_nm, 0);
+    }
+}
+
+TEST_F(Comms, failed_sensors_and_checks_have_a_bit_each) {
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        drive.temperature.failed_sensors[TEMPERATURE_WINDING] = uint8_t(1u << phase);
+        drive.temperature.failed_sensors[TEMPERATURE_INVERTER] = 0;
+        EXPECT_EQ(telemetry_self_test(&drive), phase < 4 ? 1u << phase : 0u);
+        EXPECT_EQ(telemetry_sensors_e_f(&drive), phase < 4 ? 0u : 1u << (phase - 4));
+        drive.temperature.failed_sensors[TEMPERATURE_WINDING] = 0;
+        drive.temperature.failed_sensors[TEMPERATURE_INVERTER] = uint8_t(1u << phase);
+        EXPECT_EQ(telemetry_self_test(&drive), phase < 4 ? 16u << phase : 0u);
+        EXPECT_EQ(telemetry_sensors_e_f(&drive), phase < 4 ? 0u : 4u << (phase - 4));
+    }
+    drive.temperature = {};
+    drive.self_test.failed = 1;
+    EXPECT_EQ(telemetry_self_test(&drive), 1u << SELF_TEST_TELEMETRY_BIT);
+}
+
+TEST_F(Comms, the_misalignment_is_the_mean_of_the_phases_that_the_machine_has) {
+    const int32_t part = (1 << 24) * machine_tables.rotor_poles;
+    for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        for (unsigned other = 0; other < HAL_PHASES_MAX; other++) {
+            drive.control.deferred.misalignment.phase[other].offset = other == phase ? part : 0;
+        }
+        drive_telemetry_t values;
+        telemetry_collect(&drive, 0, &values);
+        const double expected = phase < machine_tables.phases ? 4096.0 / machine_tables.phases : 0.0;
+        EXPECT_NEAR(values.adaptation.misalignment_deg, expected, 0.51) << phase;
+    }
+}
+
 TEST_F(Comms, a_blocked_bus_drops_whole_cycles_and_keeps_the_oldest) {
     run(50500, 0); // nothing leaves: three frames in mailboxes, a full queue
     EXPECT_GT(comms.telemetry.dropped, 0);

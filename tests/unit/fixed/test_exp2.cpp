@@ -32,6 +32,13 @@ TEST(Exp2, error_is_within_its_bound_for_every_exponent) {
     EXPECT_LT(worst, 1.5e-5);
 }
 
+TEST(Exp2, at_the_entries_of_the_table_the_error_is_their_rounding) {
+    for (uint32_t step = 0; step < 64; step++) {
+        const double exact_q30 = std::exp2(-double(step) / 64.0 + 30.0);
+        EXPECT_LE(std::fabs(exp2_negative_q31(step << 11) / 2.0 - exact_q30), 0.5) << step;
+    }
+}
+
 TEST(Exp2, decreases_monotonically) {
     uint32_t last = exp2_negative_q31(0);
     for (uint32_t exponent_q17 = 1; exponent_q17 <= UNDERFLOW_Q17; exponent_q17++) {

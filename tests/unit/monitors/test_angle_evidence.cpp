@@ -38,7 +38,7 @@ class AngleEvidence : public testing::Test {
         parameters.rate_hz = RATE_HZ;
         parameters.current_min_q9 = 6 << 9;
         input.run = true;
-        std::fill_n(input.known, PHASES, true);
+        std::fill_n(input.known, HAL_PHASES_MAX, true);
         input.flux_step_max_q29 = to_fixed(240.0 * PERIOD_S, Q29);
         input.period = 100;
         monitor_step();
@@ -65,7 +65,7 @@ class AngleEvidence : public testing::Test {
 
     void monitor_step() {
         flux_residual_t residual{};
-        residual.phases = PHASES;
+        residual.phases = phases;
         residual.sample.run = input.run;
         residual.sample.encoder_angle = input.encoder_angle;
         residual.sample.torque_q24 = input.torque_q24;
@@ -75,7 +75,7 @@ class AngleEvidence : public testing::Test {
         residual.sample.period_flux_q29 = input.flux_step_max_q29;
         residual.shortest_q29 =
             applied_flux_shortest_pulse_q29(input.flux_step_max_q29, machine_tables.minimum_pulse_ns, RATE_HZ / 1000u);
-        for (unsigned k = 0; k < PHASES; k++) {
+        for (unsigned k = 0; k < phases; k++) {
             residual.phase[k].current_q9 = input.current_q9[k];
             residual.phase[k].voltage_q29 = input.flux_q29[k];
             residual.phase[k].drop_q29 = input.drop_q29[k];
@@ -105,9 +105,9 @@ class AngleEvidence : public testing::Test {
 
     // One period: the phase carries a current at a true rotor angle, the encoder shows another; in degrees, A.
     void step(double encoder_deg, double true_deg, double current_A, unsigned phase = 0) {
-        input.period++;
+        input.period += spacing;
         input.encoder_angle = uint32_t(int64_t(encoder_deg * DEGREE)) & ~((1u << 15) - 1u);
-        for (unsigned k = 0; k < PHASES; k++) {
+        for (unsigned k = 0; k < phases; k++) {
             input.current_q9[k] = 0;
             input.flux_q29[k] = 0;
             input.zero_at[k] = k == phase ? input.zero_at[k] : input.period;
@@ -124,6 +124,8 @@ class AngleEvidence : public testing::Test {
     Input input{};
     int32_t resistance_period_q40 = 0;
     int32_t flux_offset_q29 = 0; // of the integral
+    unsigned phases = PHASES;
+    uint32_t spacing = 1; // periods between samples
 };
 
 TEST_F(AngleEvidence, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf_after_2_degrees) {
@@ -390,6 +392,69 @@ TEST_F(AngleEvidence, what_is_long_ago_does_not_count_again_when_the_number_of_t
     step(98.0, 98.0, 0.0);
     EXPECT_FALSE(suspects(1));
     EXPECT_FALSE(monitor.state.advanced);
+}
+
+TEST_F(AngleEvidence, a_contradiction_lasts_from_its_first_sample_on_however_far_apart_samples_are) {
+    for (const uint32_t each : {1u, 2u, 4u, 10u}) {
+        monitor = {};
+        spacing = each;
+        input.zero_at[0] = input.period + 1;
+        const uint32_t before = input.period;
+        step(77.0, 65.0, 25.0);
+        EXPECT_EQ(monitor.evidence.contradicts, 0u) << "one sample, " << each;
+        const uint32_t first = input.period;
+        while (monitor.evidence.contradicts == 0 && input.period - first < 100) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_GE(input.period - first, 2u) << each;
+        EXPECT_LT(input.period - first, 2u + each) << "three periods, " << each;
+        while (!monitor.angle && input.period - before < 1000) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_GE(input.period - first, RATE_HZ / 256u) << each;
+        EXPECT_LE(input.period - first, RATE_HZ / 256u + each) << each;
+    }
+}
+
+// Phase 3 has the angles of phase 0, and never conducts.
+TEST_F(AngleEvidence, of_four_phases_two_that_have_agreed_speak_for_the_encoder_and_one_alone_does_not) {
+    phases = 4;
+    for (const unsigned agreeing : {1u, 2u}) {
+        monitor = {};
+        for (unsigned phase = 1; phase <= agreeing; phase++) {
+            input.zero_at[phase] = input.period + 1;
+            const double aligned_deg = 65.0 + 30.0 * phase;
+            for (int k = 0; k < RATE_HZ / 500; k++) {
+                step(aligned_deg, aligned_deg, 25.0, phase);
+            }
+        }
+        input.zero_at[0] = input.period + 1;
+        for (int k = 0; k < RATE_HZ / 150; k++) {
+            step(77.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(monitor.angle, agreeing < 2) << agreeing;
+    }
+}
+
+// The flux linkage of an integral that parts by a twentieth of the DC-link voltage.
+TEST_F(AngleEvidence, an_integral_that_parts_from_its_first_sample_on_is_found_as_soon_as_one_that_does_so_later) {
+    int first = 0;
+    for (const int begins : {1, 200}) {
+        monitor = {};
+        input.zero_at[0] = input.period + 1;
+        int k = 0;
+        for (; !monitor.frozen && k < 1000; k++) {
+            flux_offset_q29 = to_fixed(0.05 * 240.0 * PERIOD_S * std::max(0, k - begins), Q29);
+            step(75.0, 75.0, 25.0);
+        }
+        ASSERT_TRUE(monitor.frozen);
+        const int found = k - begins;
+        first = begins == 1 ? found : first;
+        EXPECT_LE(first, found);
+        const uint32_t moved = monitor.state.phase[0].moved;
+        EXPECT_GT(moved, RATE_HZ / 2048.0) << "not before this time";
+        EXPECT_LE(moved - 1, RATE_HZ / 2048.0) << "and with the first sample after it";
+    }
 }
 
 } // namespace

@@ -103,4 +103,18 @@ TEST(AvailableTorque, a_load_exceeds_it_from_a_sixteenth_of_the_largest_torque_o
     EXPECT_TRUE(available_torque(&input).load_exceeds);
 }
 
+TEST(AvailableTorque, at_standstill_neither_direction_brakes) {
+    available_torque_input_t input = healthy();
+    input.speed_q22 = 0;
+    input.by_link_q24 = 1 << 20;
+    input.link_fills = true;
+    available_torque_t available = available_torque(&input);
+    expect_side(available.forward, LARGEST_Q24, TORQUE_LIMIT_CURRENT);
+    expect_side(available.backward, LARGEST_Q24, TORQUE_LIMIT_CURRENT);
+    input.by_voltage_q24[0] = input.by_voltage_q24[1] = 5 << 24;
+    available = available_torque(&input);
+    expect_side(available.forward, 5 << 24, TORQUE_LIMIT_VOLTAGE);
+    expect_side(available.backward, 5 << 24, TORQUE_LIMIT_VOLTAGE);
+}
+
 } // namespace

@@ -207,4 +207,67 @@ TEST_F(EncoderMonitor, a_rotor_that_turns_the_other_way_after_a_rest_is_no_encod
     EXPECT_FALSE(monitor.turned_round);
 }
 
+// Windows at their ends, from sample to sample.
+class EncoderWindows : public EncoderMonitor {
+  protected:
+    static constexpr uint32_t WINDOW = RATE_HZ / 2048;
+
+    // One sample a window later; travel in 2^-32 rev.
+    void window(int64_t travel) {
+        input.periods += WINDOW;
+        input.encoder_angle += uint32_t(travel);
+        encoder_monitor_step(&parameters, &monitor, &residual);
+    }
+
+    bool over_speed(int64_t travel) {
+        monitor = {};
+        window(0);
+        window(travel);
+        return monitor.over_speed;
+    }
+
+    int64_t limit() const { return int64_t(parameters.travel) * WINDOW; }
+    int64_t count() const { return 2 * int64_t(parameters.middle); }
+};
+
+TEST_F(EncoderWindows, over_speed_is_a_sixteenth_above_the_limit_and_the_count_that_the_encoder_may_err_by) {
+    for (const uint32_t middle : {1u << 14, 1u << 21}) { // 17 and 10 bits
+        parameters.middle = middle;
+        for (const int64_t sign : {1, -1}) {
+            EXPECT_FALSE(over_speed(sign * (limit() / 16 * 17 + count() / 2))) << middle << " " << sign;
+            EXPECT_TRUE(over_speed(sign * (limit() / 16 * 17 + 2 * count()))) << middle << " " << sign;
+        }
+    }
+}
+
+TEST_F(EncoderWindows, the_observer_s_speed_counts_above_the_limit_and_not_at_it) {
+    for (const int sign : {1, -1}) {
+        for (const int32_t above : {0, 1}) {
+            input.speed_q22 = sign * (parameters.over_speed_q22 + above);
+            EXPECT_EQ(over_speed(limit()), above != 0) << sign;
+            EXPECT_EQ(over_speed(limit() / 32 * 31), above != 0) << sign;
+            EXPECT_FALSE(over_speed(limit() / 32 * 31 - 2 * count())) << sign;
+        }
+    }
+}
+
+TEST_F(EncoderWindows,
+       an_encoder_that_rests_for_two_windows_between_its_directions_has_turned_round_and_for_three_not) {
+    for (const int sign : {1, -1}) {
+        for (unsigned rest = 0; rest <= 5; rest++) {
+            monitor = {};
+            window(0);
+            for (int k = 0; k < 3; k++) {
+                window(sign * (limit() / 32 + 2 * count()));
+            }
+            for (unsigned k = 0; k < rest; k++) {
+                window(0);
+            }
+            EXPECT_FALSE(monitor.turned_round);
+            window(-sign * (limit() / 32 + 2 * count()));
+            EXPECT_EQ(monitor.turned_round, rest <= 2) << rest;
+        }
+    }
+}
+
 } // namespace

@@ -1,4 +1,5 @@
 // The table of verdicts: precedence, and what each row needs.
+#include <algorithm>
 #include <cstdint>
 #include <functional>
 #include <iterator>
@@ -120,6 +121,7 @@ class FluxMonitorState : public testing::Test {
         sample.period_flux_q29 = 1 << 20;
         for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
             sample.off[phase] = true;
+            sample.current_q9[phase] = current_q9[phase];
         }
         return flux_monitor_step(&parameters, &monitor, &sample);
     }
@@ -127,6 +129,7 @@ class FluxMonitorState : public testing::Test {
     flux_monitor_parameters_t parameters = {.angle = {.rate_hz = 40000}, .encoder = {.rate_hz = 40000}, .least_q8 = 0};
     flux_monitor_t monitor{};
     uint32_t period = 0;
+    int32_t current_q9[HAL_PHASES_MAX] = {};
 };
 
 TEST_F(FluxMonitorState, a_check_that_has_failed_in_a_run_remains_failed_until_the_run_ends) {
@@ -175,6 +178,64 @@ TEST_F(FluxMonitorState, phases_with_evidence_of_a_fault_are_those_of_this_run_o
     EXPECT_EQ(monitor.phases, 2u) << "for the record, after the run";
     step(true);
     EXPECT_EQ(monitor.phases, 0u);
+}
+
+// Phases with evidence of a fault, when a sample has that of one phase and a current that others have or lack.
+class FluxMonitorPhases : public FluxMonitorState {
+  protected:
+    struct Evidence {
+        uint32_t open = 0, shorted = 0, excess = 0, missing = 0; // bits of phases; open or shorted: one phase
+    };
+
+    uint32_t phases_with(const Evidence &evidence) {
+        monitor = {};
+        period = 10000;
+        for (int k = 0; k < 5; k++) {
+            step(true);
+        }
+        phase_evidence_t &state = monitor.phases_by_current;
+        state.doubted = evidence.open | evidence.shorted; // for long enough, all others agree
+        state.doubted_side = evidence.open != 0 ? 1 : -1;
+        state.doubted_at = 0;
+        state.doubt_turned_q24 = 1 << 24;
+        state.agreed = 7u;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            current_q9[phase] = (evidence.excess >> phase & 1u) != 0 ? 5 * 512 : 0;
+            state.phase[phase].vanished = (evidence.missing >> phase & 1u) != 0;
+            state.phase[phase].vanished_at = period;
+        }
+        step(true);
+        std::fill_n(current_q9, 3, 0);
+        return monitor.phases;
+    }
+};
+
+TEST_F(FluxMonitorPhases, a_current_that_an_open_phase_may_lack_makes_the_phase_that_has_it_suspect) {
+    EXPECT_EQ(phases_with({.open = 1}), 1u);
+    EXPECT_EQ(phases_with({.excess = 2}), 0u) << "it has lasted for one sample";
+    EXPECT_EQ(phases_with({.open = 1, .excess = 2}), 3u);
+    EXPECT_EQ(phases_with({.open = 4, .excess = 1}), 5u);
+    EXPECT_EQ(phases_with({.open = 1, .excess = 6}), 7u);
+    EXPECT_EQ(phases_with({.open = 1, .missing = 4}), 1u) << "what is missing is found in no other";
+    EXPECT_EQ(phases_with({.open = 1, .excess = 2, .missing = 4}), 7u);
+    EXPECT_EQ(phases_with({.open = 1, .excess = 2, .missing = 6}), 3u) << "two lack it: either may";
+}
+
+TEST_F(FluxMonitorPhases, a_current_that_is_missing_makes_its_phase_suspect_when_another_is_shorted) {
+    for (unsigned shorted = 0; shorted < 3; shorted++) {
+        EXPECT_EQ(phases_with({.shorted = 1u << shorted}), 1u << shorted);
+        for (unsigned missing = 0; missing < 3; missing++) {
+            EXPECT_EQ(phases_with({.missing = 1u << missing}), 0u) << missing;
+            EXPECT_EQ(phases_with({.shorted = 1u << shorted, .missing = 1u << missing}), 1u << shorted | 1u << missing);
+            if (missing != shorted) {
+                EXPECT_EQ(phases_with({.shorted = 1u << shorted, .excess = 1u << missing, .missing = 1u << missing}),
+                          1u << shorted)
+                    << "of the phase that has it";
+            }
+        }
+        EXPECT_EQ(phases_with({.shorted = 1u << shorted, .missing = 7u & ~(1u << shorted)}), 1u << shorted)
+            << "two lack it: either may";
+    }
 }
 
 } // namespace

@@ -5,6 +5,8 @@
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "control/applied_flux.h"
+#include "control/machine_tables.h"
 #include "monitors/flux_monitor.h"
 #include "storage/fault.h"
 }
@@ -169,6 +171,44 @@ TEST_F(PhaseBalance, a_ratio_beyond_256_is_too_large_and_not_a_small_one) {
     ratio[1] = 257.0;    // 1 modulo 256
     EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR));
     EXPECT_EQ(balance.unbalanced, 2u);
+}
+
+TEST_F(PhaseBalance, a_sample_counts_up_to_10_ms_after_the_phase_was_without_current) {
+    ratio[1] = 1.36;
+    for (const auto &[age, counted] : {std::pair{396u, true}, std::pair{404u, false}}) {
+        residual.sample.periods = age;
+        EXPECT_EQ(window(), counted ? FAULT_BIT(FAULT_CURRENT_SENSOR) : 0u) << age;
+        balance = {};
+    }
+}
+
+// In 7.5 ms: 1/64 of the DC-link voltage or the threshold of the devices, whichever is more, and a warm winding.
+TEST_F(PhaseBalance, a_sample_counts_while_what_may_be_drift_is_less_than_half_of_the_flux_linkage) {
+    ratio[1] = 1.36;
+    residual.sample.periods = 300;
+    const double half_q29 = TABLE_Q29 / 2.0;
+    for (const auto &[part, counted] : {std::pair{0.995, true}, std::pair{1.005, false}}) {
+        residual.sample.period_flux_q29 = int32_t(part * half_q29 / 300.0 * 64.0);
+        EXPECT_EQ(window() != 0, counted) << part;
+        balance = {};
+        residual.sample.period_flux_q29 /= 2;
+        residual.device_q29 = int32_t(part * half_q29 / 300.0);
+        EXPECT_EQ(window() != 0, counted) << part;
+        balance = {};
+        residual.sample.period_flux_q29 = residual.device_q29 = 0;
+        for (flux_residual_phase_t &phase : residual.phase) {
+            phase.drop_q29 = int32_t(part * half_q29 * 1.0);
+            while (applied_flux_warm_q29(&machine_tables, phase.drop_q29) < part * half_q29) {
+                phase.drop_q29 += TABLE_Q29 / 4096;
+            }
+            phase.drop_q29 -= counted ? TABLE_Q29 / 4096 : 0;
+        }
+        EXPECT_EQ(window() != 0, counted) << part;
+        balance = {};
+        for (flux_residual_phase_t &phase : residual.phase) {
+            phase.drop_q29 = 0;
+        }
+    }
 }
 
 } // namespace

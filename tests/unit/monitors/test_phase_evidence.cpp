@@ -236,4 +236,27 @@ TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
     EXPECT_EQ(correction_q29[0], 0);
 }
 
+// Phase b differs, c conducts at every angle, so that it agrees in each sample; a conducts in its turn or not at all.
+TEST_F(PhaseEvidence, one_phase_that_differs_for_long_is_none_until_each_of_the_others_has_agreed) {
+    for (unsigned a = 0; a < 3; a++) {
+        for (const bool conducts_too : {false, true}) {
+            monitor = {};
+            const unsigned b = (a + 1) % 3;
+            const int periods = periods_to_fault(2000, [&](int) {
+                input.electrical += 1u << 24; // 256 periods in a revolution
+                for (unsigned phase = 0; phase < 3; phase++) {
+                    const uint32_t angle = input.electrical - phase * input.stroke;
+                    const bool in_turn = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
+                    const bool conducts = phase == a ? in_turn && conducts_too : phase != b || in_turn;
+                    const double flux_Wb = phase_map_results::flux_q29(machine_tables, angle, 10 * 512) / Q29;
+                    set(phase, conducts ? 10.0 : 0.0, conducts ? (phase == b ? 1.8 : 1.0) * flux_Wb : 0.0);
+                    input.off[phase] = !conducts;
+                }
+            });
+            EXPECT_EQ(periods > 0, conducts_too) << a;
+            EXPECT_EQ(failed, conducts_too ? FAULT_BIT(FAULT_PHASE_OPEN) : 0u) << a;
+        }
+    }
+}
+
 } // namespace

@@ -408,4 +408,28 @@ TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
     }
 }
 
+TEST(ProtectionStandstill, an_encoder_that_does_not_count_is_a_fault_from_1_rad_s_on_and_none_below) {
+    protection_parameters_t parameters = PARAMETERS;
+    parameters.deceleration_max_q22 = 0;
+    for (const int32_t sign : {1, -1}) {
+        for (const int32_t speed_q22 : {(1 << 22) - 1, 1 << 22}) {
+            protection_deferred_t state;
+            protection_deferred_reset(&state, 5000);
+            protection_deferred_input_t input = {
+                .dc_link_voltage_q6 = 240 << 6,
+                .speed_q22 = sign * speed_q22,
+                .encoder_angle = 5000,
+                .command_age_us = 0,
+                .periods = 1,
+            };
+            uint64_t failed = 0;
+            for (int period = 0; period < 1000; period++) {
+                input.encoder_angle += period < 2 ? 1u : 0u;
+                failed |= protection_check_deferred(&parameters, &state, &input);
+            }
+            EXPECT_EQ(failed, speed_q22 == 1 << 22 ? FAULT_BIT(FAULT_ENCODER) : 0u) << sign * speed_q22;
+        }
+    }
+}
+
 } // namespace

@@ -224,4 +224,56 @@ TEST_F(Stall, rotor_that_stands_without_much_torque_is_not_stalled_when_the_cloc
     }
 }
 
+// Electrical rev/s to rad/s, Q22.
+int32_t electrical_q22(double rev_s) {
+    return static_cast<int32_t>(rev_s * 2 * M_PI / machine_tables.rotor_poles * RAD_S);
+}
+
+// 0.4 electrical revolutions forwards and back again: within where it has been. The last new angle, by half a stroke, a
+// sixth of a revolution each, was at 208 ms; 225 ms and a quarter of that for three strokes of the reference later it
+// is stalled.
+TEST_F(Stall, rotor_that_comes_back_to_where_it_has_been_makes_no_progress) {
+    for (const int direction : {1, -1}) {
+        input.speed_reference_q22 = direction * 30 * RAD_S;
+        input.torque_reference_q24 = 0;
+        EXPECT_NEAR(
+            time_to_fault_us(
+                520000, [&](uint32_t us) { input.speed_q22 = direction * electrical_q22(us < 250000 ? 1.6 : -1.6); }),
+            490000, 10000);
+    }
+}
+
+TEST_F(Stall, rotor_that_swings_after_it_was_driven_backwards_by_several_revolutions_is_stalled) {
+    input.speed_reference_q22 = 30 * RAD_S;
+    input.torque_reference_q24 = 0;
+    const auto swings = [&](uint32_t us) {
+        const double rate = 2 * M_PI * 20.0;
+        input.speed_q22 = electrical_q22(us < 1000000 ? -6.0 : 0.3 * rate * std::cos(rate * us * 1e-6));
+    };
+    EXPECT_NEAR(time_to_fault_us(2000000, swings), 1310000, 50000);
+}
+
+TEST_F(Stall, rotor_that_turns_backwards_has_more_time_when_it_becomes_slower_but_not_when_it_stands_for_a_moment) {
+    input.speed_reference_q22 = 30 * RAD_S;
+    input.torque_reference_q24 = 0;
+    for (const auto &[then, fault_us] :
+         {std::pair{0.0, 281000.0}, std::pair{-0.2, 281000.0}, std::pair{-0.03, 481000.0}}) {
+        const auto turns = [&, then = then](uint32_t us) {
+            input.speed_q22 = electrical_q22(us == 200000 ? then : -0.2);
+        };
+        EXPECT_NEAR(time_to_fault_us(600000, turns), fault_us, 3000) << then;
+    }
+}
+
+TEST_F(Stall, rotor_that_is_at_its_reference_is_not_stalled_though_it_was_slow_with_the_torque_at_its_limit) {
+    for (const int direction : {1, -1}) {
+        input.torque_reference_q24 = direction * 19 * NM;
+        input.speed_q22 = direction * 25 * RAD_S;
+        const auto lowered = [&](uint32_t us) {
+            input.speed_reference_q22 = direction * (us < 50000 ? 60 : 25) * RAD_S;
+        };
+        EXPECT_EQ(time_to_fault_us(1000000, lowered), 0u) << direction;
+    }
+}
+
 } // namespace

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <tuple>
 #include <vector>
 
 #include <gtest/gtest.h>
@@ -142,6 +143,41 @@ TEST_F(Temperature, sensor_that_is_open_at_the_first_reading_has_failed_then_and
     hal.code[HAL_ADC_INVERTER] = 65520;
     step();
     EXPECT_EQ(faults(), FAULT_BIT(FAULT_TEMPERATURE_SENSOR));
+}
+
+TEST_F(Temperature, the_first_step_is_due_at_the_start_whenever_it_comes_then) {
+    hal.code[HAL_ADC_WINDING] = code_of(160.0);
+    for (const uint32_t start_us : {0u, 5000u, UINT32_MAX - 12000}) {
+        for (const uint32_t later_us :
+             {0u, TEMPERATURE_STEP_US - 1, TEMPERATURE_STEP_US, 3 * TEMPERATURE_STEP_US / 2}) {
+            temperature_init(&temperature, start_us);
+            EXPECT_EQ(faults(), 0u);
+            EXPECT_EQ(temperature.torque_limit_q24, INT32_MAX);
+            temperature_step(&parameters, &temperature, &hal, PHASES, start_us + later_us);
+            EXPECT_EQ(faults(), FAULT_BIT(FAULT_WINDING_OVERLOAD)) << start_us << " " << later_us;
+        }
+    }
+}
+
+TEST_F(Temperature, each_sensor_of_either_part_has_a_bit_of_its_own_and_a_part_its_own_fault) {
+    for (unsigned phase = 0; phase < PHASES; phase++) {
+        for (const auto &[first, part, fault] :
+             {std::tuple(unsigned(HAL_ADC_WINDING), TEMPERATURE_WINDING, FAULT_WINDING_OVERLOAD),
+              std::tuple(unsigned(HAL_ADC_INVERTER), TEMPERATURE_INVERTER, FAULT_INVERTER_OVERLOAD)}) {
+            hal.code.fill(code_of(25.0));
+            temperature_init(&temperature, time_us);
+            hal.code[first + phase] = code_of(155.0);
+            step();
+            EXPECT_EQ(faults(), FAULT_BIT(fault)) << phase;
+            EXPECT_NEAR(temperature_C(&temperature, part), 155.0, 1.0);
+            temperature_init(&temperature, time_us);
+            hal.code[first + phase] = 0;
+            step();
+            EXPECT_EQ(faults(), FAULT_BIT(FAULT_TEMPERATURE_SENSOR)) << phase;
+            EXPECT_EQ(temperature.failed_sensors[part], 1u << phase);
+            EXPECT_EQ(temperature.failed_sensors[TEMPERATURE_WINDING + TEMPERATURE_INVERTER - part], 0u);
+        }
+    }
 }
 
 } // namespace

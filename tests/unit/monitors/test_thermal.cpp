@@ -179,4 +179,16 @@ TEST(Step, counts_a_background_that_was_late_as_long_as_it_was_but_at_most_a_ten
     EXPECT_FALSE(thermal_sample(&parameters, &thermal, current_q9, 999));
 }
 
+TEST(Step, counts_squares_of_more_than_64_times_that_of_the_continuous_current_as_64_times) {
+    const auto parameters = configure({2.0, 3.0, 10});
+    for (const auto &[current_A, winding, switches] :
+         {std::tuple{15.8, 62.41, 27.738}, std::tuple{17.0, 64.0, 32.111}, std::tuple{127.0, 64.0, 64.0}}) {
+        const int32_t current_q9[HAL_PHASES_MAX] = {0, 0, int32_t(current_A * A)};
+        thermal_t thermal{};
+        ASSERT_TRUE(thermal_sample(&parameters, &thermal, current_q9, 100000));
+        EXPECT_NEAR(thermal_winding_load_q16(&thermal) / 65536.0, winding * 0.1 / 10.0, 1e-3) << current_A;
+        EXPECT_NEAR(thermal_switch_load_q16(&thermal) / 65536.0, switches * 0.1, 1e-2) << current_A;
+    }
+}
+
 } // namespace

@@ -7,6 +7,7 @@
 
 extern "C" {
 #include "control/machine_tables.h"
+#include "storage/nvm_ring.h"
 #include "support/power_cuts.h"
 }
 

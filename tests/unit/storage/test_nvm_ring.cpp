@@ -1,0 +1,167 @@
+// Records in two pages: what a start finds, and what one that is given up leaves.
+#include <array>
+#include <cstring>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "storage/nvm_ring.h"
+#include "support/power_cuts.h"
+}
+
+namespace {
+
+constexpr unsigned PAGE = 2, PAYLOAD = 4, RECORD_WORDS = PAYLOAD + NVM_RING_OVERHEAD;
+
+using payload_t = std::array<uint64_t, PAYLOAD>;
+
+payload_t payload_of(uint64_t number) {
+    payload_t payload;
+    for (unsigned i = 0; i < PAYLOAD; i++) {
+        payload[i] = number << 56 | (number * 1000003u + i);
+    }
+    return payload;
+}
+
+class NvmRing : public testing::Test {
+  protected:
+    NvmRing() {
+        nvm_init(&hal.nvm);
+        start();
+    }
+
+    void start() { nvm_ring_init(&ring, &hal, PAGE, RECORD_WORDS); }
+
+    nvm_ring_result_t step(const payload_t &payload) {
+        const unsigned index = nvm_ring_payload_index(&ring);
+        return nvm_ring_step(&ring, &hal, index < PAYLOAD ? payload[index] : 0);
+    }
+
+    // Steps until the record is written.
+    unsigned write(uint64_t number) {
+        unsigned steps = 1;
+        nvm_ring_result_t result;
+        while ((result = step(payload_of(number))) == NVM_RING_BUSY && steps < 100) {
+            steps++;
+        }
+        EXPECT_EQ(result, NVM_RING_WRITTEN);
+        return steps;
+    }
+
+    // A record is there, and is that of the number.
+    bool has(uint32_t sequence, uint64_t number) {
+        payload_t payload{};
+        return nvm_ring_read(&ring, &hal, sequence, payload.data()) && payload == payload_of(number);
+    }
+
+    uint64_t &word(unsigned slot, unsigned index) { return hal.nvm.word[PAGE][slot * RECORD_WORDS + index]; }
+
+    hal_t hal{};
+    nvm_ring_t ring{};
+};
+
+TEST_F(NvmRing, an_erased_memory_has_no_record_and_no_damage) {
+    EXPECT_EQ(ring.sequence, 0u);
+    EXPECT_FALSE(ring.damaged);
+    EXPECT_FALSE(ring.torn_commit);
+    EXPECT_FALSE(has(0, 0));
+    EXPECT_FALSE(has(1, 1));
+}
+
+TEST_F(NvmRing, a_record_takes_one_step_for_each_word_and_is_found_again) {
+    for (uint32_t number = 1; number <= 5; number++) {
+        EXPECT_EQ(write(number), RECORD_WORDS);
+        start();
+        EXPECT_EQ(ring.sequence, number);
+        EXPECT_TRUE(has(number, number));
+        EXPECT_FALSE(ring.damaged);
+        EXPECT_FALSE(ring.torn_commit);
+    }
+}
+
+TEST_F(NvmRing, every_bit_of_a_committed_record_that_flips_makes_it_damaged_until_one_is_written) {
+    write(1);
+    for (unsigned index = 0; index + 1 < RECORD_WORDS; index++) {
+        for (unsigned bit = 0; bit < 64; bit++) {
+            word(0, index) ^= UINT64_C(1) << bit;
+            start();
+            EXPECT_EQ(ring.sequence, 0u) << index << ", " << bit;
+            EXPECT_TRUE(ring.damaged) << index << ", " << bit;
+            EXPECT_FALSE(has(1, 1));
+            word(0, index) ^= UINT64_C(1) << bit;
+        }
+    }
+    word(0, 1) ^= 1;
+    start();
+    write(2);
+    EXPECT_FALSE(ring.damaged) << "there is a valid one now";
+    EXPECT_TRUE(has(1, 2));
+}
+
+TEST_F(NvmRing, an_unfinished_record_is_no_damage) {
+    for (unsigned steps = 1; steps < RECORD_WORDS; steps++) {
+        nvm_init(&hal.nvm);
+        start();
+        for (unsigned i = 0; i < steps; i++) {
+            EXPECT_EQ(step(payload_of(1)), NVM_RING_BUSY);
+        }
+        start();
+        EXPECT_EQ(ring.sequence, 0u);
+        EXPECT_FALSE(ring.damaged) << steps;
+    }
+}
+
+TEST_F(NvmRing, a_torn_commit_word_is_told_until_the_next_record_is_written) {
+    write(1);
+    word(0, RECORD_WORDS - 1) ^= 1;
+    start();
+    EXPECT_TRUE(has(1, 1));
+    EXPECT_TRUE(ring.torn_commit);
+    EXPECT_FALSE(ring.damaged);
+    write(2);
+    EXPECT_FALSE(ring.torn_commit);
+    start();
+    EXPECT_FALSE(ring.torn_commit) << "that of an older record does not matter";
+}
+
+TEST_F(NvmRing, a_record_that_is_given_up_is_begun_anew_in_another_place) {
+    for (unsigned steps = 0; steps < RECORD_WORDS; steps++) {
+        nvm_init(&hal.nvm);
+        start();
+        write(1);
+        for (unsigned i = 0; i < steps; i++) {
+            EXPECT_EQ(step(payload_of(2)), NVM_RING_BUSY);
+        }
+        const unsigned slot = ring.slot;
+        nvm_ring_abandon(&ring, &hal);
+        EXPECT_EQ(ring.slot, slot + (steps > 0 ? 1u : 0u)) << steps;
+        EXPECT_EQ(write(3), RECORD_WORDS) << "all words, after " << steps;
+        EXPECT_TRUE(has(1, 1));
+        EXPECT_TRUE(has(2, 3));
+    }
+}
+
+TEST_F(NvmRing, a_full_page_costs_one_step_for_the_erasure_of_the_other_and_keeps_the_newest) {
+    constexpr unsigned SLOTS = HAL_NVM_PAGE_WORDS / RECORD_WORDS;
+    for (uint32_t number = 1; number <= 4 * SLOTS + 1; number++) {
+        const bool erases = number > 1 && (number - 1) % SLOTS == 0;
+        EXPECT_EQ(write(number), RECORD_WORDS + (erases ? 1 : 0)) << number;
+        const uint32_t oldest = number <= 2 * SLOTS ? 1 : number - SLOTS - (number - 1) % SLOTS;
+        EXPECT_TRUE(has(number, number));
+        EXPECT_TRUE(has(oldest, oldest)) << number;
+        EXPECT_FALSE(has(oldest - 1, oldest - 1)) << number;
+    }
+    EXPECT_EQ(hal.nvm.erasures[PAGE] + hal.nvm.erasures[PAGE + 1], 4u);
+    EXPECT_EQ(hal.nvm.erasures[PAGE - 1] + hal.nvm.erasures[PAGE + 2], 0u);
+}
+
+TEST_F(NvmRing, fails_after_four_places_that_do_not_take_the_record_and_counts_them_anew_for_the_next) {
+    for (int record = 0; record < 2; record++) {
+        hal.worn_page = PAGE;
+        for (unsigned attempt = 1; attempt <= NVM_RING_ATTEMPTS; attempt++) {
+            EXPECT_EQ(step(payload_of(1)), attempt < NVM_RING_ATTEMPTS ? NVM_RING_BUSY : NVM_RING_FAILED) << attempt;
+        }
+    }
+}
+
+} // namespace
