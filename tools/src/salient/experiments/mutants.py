@@ -225,7 +225,6 @@ def summary(found: Sequence[tuple[Mutant, dict[str, str]]], known: dict[str, str
 def run(chosen: Sequence[Mutant], out: Path, seed: int, per_file: int | None) -> dict[str, Any]:
     """Judges mutants; returns the summary, which is also in the folder."""
     known = read_exceptions(KNOWN)
-    planted.build_unchanged(sorted({finder for mutant in chosen for finder in mutant.found_by}))
     sources = planted.sources("unit")
     looks = [tasks.Task(hashlib.sha256(f"{sources} {mutant.name}".encode()).hexdigest()[:16], mutant)
              for mutant in chosen]
@@ -253,6 +252,7 @@ def main() -> int:
     options = parser.parse_args()
     files = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "firmware").rglob("*.c"))]
     named = [file for file in files if any(part in file for part in options.file)]
+    planted.build_unchanged([])  # the programs that judge are those of the build folder
     chosen = drawn(named, options.per_file, options.seed)
     if not chosen:
         raise UsageError(f"--file {' '.join(options.file)}: no source of firmware/ has this in its path")

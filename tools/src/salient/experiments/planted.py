@@ -148,11 +148,11 @@ def _target(finder: str) -> str:
 
 
 def build_unchanged(finders: Sequence[str]) -> None:
-    """The programs without a bug, whose objects are linked; UsageError."""
+    """The programs without a bug, whose objects are linked, or without finders all of them; UsageError."""
     targets = {_target(finder) for finder in finders} - {CAMPAIGN}
     if CAMPAIGN in finders:
         targets |= {"salient_campaign", "salient_host"}
-    for command in (["cmake", "--preset", "host"], ["cmake", "--build", "--preset", "host", "--target", *targets]):
+    for command in (["cmake", "--preset", "host"], ["cmake", "--build", "--preset", "host", *(["--target", *targets] if targets else [])]):
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise UsageError(f"{shlex.join(command[:4])} fails: {done.stdout.strip()[-2000:]}")
