@@ -1,4 +1,5 @@
-// Measurement step: the angle by the encoder's edges and counts, the largest current, the torque that the currents imply.
+// Measurement step: the angle by the encoder's edges and counts, the largest current, the torque that the currents
+// imply.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -8,6 +9,7 @@
 extern "C" {
 #include "control/phase_map.h"
 #include "interrupts/measure.h"
+#include "interrupts/torque_control.h"
 }
 
 #include "support/configured.h"
@@ -58,7 +60,8 @@ TEST_F(Measure, an_edge_is_extrapolated_at_the_speed_of_the_observer_in_both_dir
         sample.encoder.edge_known = true;
         for (const int32_t speed_rad_s : {-300, -20, 0, 20, 300}) {
             state.observer.speed_q22 = speed_rad_s * (1 << 22);
-            for (const uint32_t age : {0u, 1u, parameters.edge_age_max_ticks / 2u, 1u * parameters.edge_age_max_ticks}) {
+            for (const uint32_t age :
+                 {0u, 1u, parameters.edge_age_max_ticks / 2u, 1u * parameters.edge_age_max_ticks}) {
                 sample.encoder.edge_forward = speed_rad_s >= 0;
                 sample.encoder.edge_age_ticks = age;
                 step();
@@ -78,7 +81,8 @@ TEST_F(Measure, an_edge_that_is_too_old_limits_the_predicted_angle_to_its_count)
     sample.encoder.edge_known = true;
     sample.encoder.edge_age_ticks = parameters.edge_age_max_ticks + 1u;
     const uint32_t first = 100 * COUNT, last = 101 * COUNT - 1;
-    for (const uint32_t predicted : {first - COUNT, first - 1, first, first + 1, last - 1, last, last + 1, last + COUNT}) {
+    for (const uint32_t predicted :
+         {first - COUNT, first - 1, first, first + 1, last - 1, last, last + 1, last + COUNT}) {
         state.observer.angle_q64 = uint64_t(predicted) << 32;
         step();
         EXPECT_EQ(state.measurement.angle, std::clamp(predicted, first, last)) << int32_t(predicted - first);
@@ -123,6 +127,50 @@ TEST_F(Measure, torque_is_that_of_the_tables_at_the_angle_of_each_phase_and_0_wh
         measure_torque(&parameters, &state, misalignment, true);
         EXPECT_EQ(state.measurement.torque_sum_q24, 0);
     }
+}
+
+TEST_F(Measure, channels_without_a_phase_are_not_looked_at) {
+    for (unsigned phase = machine_tables.phases; phase < HAL_PHASES_MAX; phase++) {
+        sample.adc.phase_current_counts[phase] = 4000;
+    }
+    step();
+    EXPECT_EQ(state.measurement.current_max_q9, 0);
+    for (unsigned phase = machine_tables.phases; phase < HAL_PHASES_MAX; phase++) {
+        EXPECT_EQ(state.measurement.current_q9[phase], 0) << phase;
+    }
+}
+
+TEST_F(Measure, torque_and_flux_linkage_of_predictive_control_are_those_of_the_planned_cells_in_a_failed_period_too) {
+    reset(DRIVE_CONTROLLER_SALIENT);
+    deferred_results_t results = *deferred_in_effect(&state);
+    state.measurement.dc_link_voltage_q6 = 240 << 6;
+    state.torque_reference_q24 = 8 << 24;
+    state.observer.angle_q64 = uint64_t(5) << 59;
+    for (int k = 0; k < 4; k++) {
+        torque_control(&parameters, &state, &results); // plans the cells, of two samples in turn
+    }
+    unsigned with_torque = 0;
+    const int32_t misalignment[HAL_PHASES_MAX] = {};
+    const phase_cell_t *cells = predictive_torque_cells(&state.predictive);
+    for (unsigned only = 0; only < machine_tables.phases; only++) {
+        std::fill_n(state.measurement.current_q9, HAL_PHASES_MAX, 0);
+        std::fill_n(state.measurement.flux_linkage, HAL_PHASES_MAX, 99);
+        state.measurement.current_q9[only] = 20 << 9;
+        for (const bool failed : {false, true}) {
+            measure_torque(&parameters, &state, misalignment, failed);
+            int32_t flux = 0;
+            const int32_t torque = predictive_torque_estimate(&cells[only], 20 << 9, &flux);
+            with_torque += torque != 0;
+            EXPECT_NEAR(state.measurement.torque_sum_q24, phase_map_scale(&machine_tables.torque_format, torque), 2);
+            for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+                EXPECT_EQ(state.measurement.flux_linkage[phase], phase == only ? flux : 0) << phase;
+            }
+            for (unsigned phase = machine_tables.phases; phase < HAL_PHASES_MAX; phase++) {
+                EXPECT_EQ(state.measurement.flux_linkage[phase], 99) << "no phase " << phase;
+            }
+        }
+    }
+    EXPECT_GE(with_torque, 2u);
 }
 
 } // namespace

@@ -50,8 +50,8 @@ TEST_F(Observe, an_observer_that_slips_begins_again_at_the_encoders_angle_and_it
                 const uint32_t half = periods_per_ms / 2;
                 const int32_t step = rotation / int32_t(half);
                 ASSERT_TRUE(recover(half + 1, periods_per_ms, uint32_t(step), innovation));
-                const double expected = std::ldexp(2.0 * fixed_point::PI * 2000.0 * step * half,
-                                                   22 - 32 - machine_tables.speed_exponent);
+                const double expected =
+                    std::ldexp(2.0 * fixed_point::PI * 2000.0 * step * half, 22 - 32 - machine_tables.speed_exponent);
                 EXPECT_NEAR(state.observer.speed_q22, expected, 5.0) << "10^-6 rad/s";
                 load_observer_t begun;
                 load_observer_reset(&begun, state.measurement.angle);
@@ -106,7 +106,9 @@ TEST_F(Observe, a_count_that_does_not_change_limits_the_speed_in_both_directions
             results.slow_counts.slow = true;
             results.slow_counts.encoder_angle = 0x40000000u;
             results.slow_counts.speed_max_q22 = MAX_Q22;
-            state.observer = {.angle_q64 = uint64_t(0x40000000u) << 32, .speed_q22 = speed_q22, .load_torque_q24 = 0,
+            state.observer = {.angle_q64 = uint64_t(0x40000000u) << 32,
+                              .speed_q22 = speed_q22,
+                              .load_torque_q24 = 0,
                               .speed_correction_q22 = 0};
             state.measurement.angle = 0x40000000u; // as predicted
             state.measurement.encoder_angle = same ? 0x40000000u : 0x40008000u;

@@ -145,6 +145,8 @@ TEST_F(TorqueControl, the_voltage_is_saturated_by_a_full_duty_or_with_predictive
     for (const drive_controller_t controller : {HYSTERESIS, DUTY, PREDICTIVE}) {
         reset(controller);
         EXPECT_FALSE(torque_control_voltage_saturated(&parameters, &state));
+        std::fill(state.duty_q15 + machine_tables.phases, state.duty_q15 + HAL_PHASES_MAX, 32768);
+        EXPECT_FALSE(torque_control_voltage_saturated(&parameters, &state)) << "duties of no phase";
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             std::fill_n(state.duty_q15, HAL_PHASES_MAX, 32767);
             EXPECT_FALSE(torque_control_voltage_saturated(&parameters, &state));
