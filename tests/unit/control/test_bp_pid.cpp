@@ -266,4 +266,49 @@ TEST(BpPid, clearing_telemetry_zeroes_duty_and_gains) {
     }
 }
 
+TEST(BpPid, a_reset_leaves_no_error_no_duty_no_gain_to_report_and_nothing_to_learn_from) {
+    tuned_pid_t tuned(parameters_of(BP_PID_LEARNING));
+    for (int k = 0; k < 5; k++) {
+        tuned.step((k + 1) << 20);
+    }
+    ASSERT_TRUE(tuned.pid.sample.learns);
+    ASSERT_NE(tuned.pid.duty_q23, 0);
+    bp_pid_reset(&tuned.pid);
+    EXPECT_EQ(tuned.pid.error_q16, 0);
+    EXPECT_EQ(tuned.pid.error_difference_q16, 0);
+    EXPECT_EQ(tuned.pid.duty_q23, 0);
+    EXPECT_FALSE(tuned.pid.sample.learns);
+    for (const int32_t gain_q24 : tuned.pid.gain_q24) {
+        EXPECT_EQ(gain_q24, 0);
+    }
+}
+
+TEST(BpTuner, after_a_reset_learns_as_a_new_one_and_not_from_the_samples_before) {
+    const bp_pid_parameters_t parameters = parameters_of(BP_PID_LEARNING);
+    bp_tuner_t used{}, fresh{};
+    bp_tuner_reset(&parameters, &used);
+    bp_tuner_reset(&parameters, &fresh);
+    const bp_pid_sample_t before = {{1 << 30, -(1 << 29), 1 << 28}, true};
+    const bp_pid_sample_t after[] = {{{1 << 28, 1 << 30, -(1 << 29)}, true}, {{-(1 << 29), 1 << 27, 1 << 30}, true}};
+    for (int k = 0; k < 10; k++) {
+        bp_tuner_step(&parameters, &used, &before);
+    }
+    bp_tuner_reset(&parameters, &used);
+    for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+        EXPECT_NEAR(used.gain_q24[l], parameters.scale_q28[l] / 32, 1) << "half of the scale";
+    }
+    for (const bp_pid_sample_t &sample : after) {
+        bp_tuner_step(&parameters, &used, &sample);
+        bp_tuner_step(&parameters, &fresh, &sample);
+        for (unsigned i = 0; i < BP_HIDDEN; i++) {
+            for (unsigned l = 0; l < BP_OUTPUTS; l++) {
+                EXPECT_EQ(used.network.hidden[i].output.value[l], fresh.network.hidden[i].output.value[l]) << i;
+            }
+            for (unsigned j = 0; j < BP_INPUTS; j++) {
+                EXPECT_EQ(used.network.hidden[i].input.value[j], fresh.network.hidden[i].input.value[j]) << i;
+            }
+        }
+    }
+}
+
 } // namespace

@@ -1,4 +1,5 @@
 // Whether the mean load of the strokes is constant.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <functional>
@@ -179,6 +180,50 @@ TEST(StrokeMean, the_largest_loads_and_a_shaft_at_rest_overflow_nothing) {
     EXPECT_LT(constant_share(
                   3000.0, [](double t, double) { return std::fmod(t, 0.1) < 0.05 ? 64.0 : -64.0; }, 64.0),
               1.0);
+}
+
+// Strokes of 250 ms with a load of 8 N m and a swing of its own each.
+TEST(StrokeMean, an_amplitude_grows_by_more_than_an_eighth_of_the_tolerated_change_or_not_at_all) {
+    constexpr uint32_t UPDATES = RATE_HZ / 4;
+    const stroke_mean_parameters_t parameters = stroke_mean_configure(PHASES, RATE_HZ);
+    stroke_mean_t mean{};
+    const double swing_Nm[] = {2.0, 2.0, 2.0, 2.1, 2.1, 2.5, 2.5, 2.5, 2.0, 2.0};
+    const bool grown[] = {false, false, false, false, false, true, true, false, false, false};
+    for (unsigned k = 0; k < 11 * UPDATES; k++) {
+        const double stroke = double(k) / UPDATES;
+        const unsigned number = k / UPDATES;
+        const double load_Nm = 8.0 + swing_Nm[std::min(number, 9u)] * std::sin(2.0 * PI * stroke);
+        stroke_mean_step(&parameters, &mean, angle_from_rev(stroke / PHASES), to_fixed(load_Nm, Q24),
+                         to_fixed(8.0, Q24), false);
+        if (stroke_mean_to_review(&mean)) {
+            stroke_mean_review(&parameters, &mean);
+            if (number >= 3) { // the first one, of a new load, counts for the second too
+                EXPECT_EQ(mean.grown, grown[number - 1]) << number;
+            }
+        }
+    }
+}
+
+TEST(StrokeMean, strokes_that_were_disturbed_are_those_of_the_present_load_alone) {
+    constexpr uint32_t UPDATES = 100;
+    const stroke_mean_parameters_t parameters = stroke_mean_configure(PHASES, RATE_HZ);
+    stroke_mean_t mean{};
+    bool changed = false;
+    for (unsigned k = 0; k < 40 * UPDATES; k++) {
+        const double load_Nm = k < 30 * UPDATES ? 8.0 : 12.0;
+        stroke_mean_step(&parameters, &mean, angle_from_rev(double(k) / UPDATES / PHASES), to_fixed(load_Nm, Q24),
+                         to_fixed(8.0, Q24), true);
+        if (k == 30 * UPDATES - 1) {
+            EXPECT_GE(mean.disturbed_strokes, 8u);
+            EXPECT_TRUE(stroke_mean_shows_load(&mean)) << "the machine disturbs itself";
+        }
+        if (k > 30 * UPDATES && !changed && stroke_mean_ended(&mean) && mean.changed) {
+            changed = true;
+            EXPECT_EQ(mean.disturbed_strokes, 0u);
+            EXPECT_FALSE(stroke_mean_shows_load(&mean));
+        }
+    }
+    EXPECT_TRUE(changed);
 }
 
 } // namespace

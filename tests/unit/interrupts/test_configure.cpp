@@ -11,6 +11,7 @@ extern "C" {
 #include "control/phase_map.h"
 #include "fixed/formats.h"
 #include "interrupts/configure.h"
+#include "interrupts/configure_torque.h"
 #include "interrupts/deferred.h"
 }
 

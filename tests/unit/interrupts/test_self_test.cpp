@@ -214,6 +214,27 @@ TEST_F(SelfTest, clocks_that_differ_by_more_than_5_percent_fail_within_two_inter
     }
 }
 
+TEST_F(SelfTest, the_clocks_may_differ_by_exactly_5_percent_of_the_interval_and_by_no_microsecond_more) {
+    const uint32_t tolerance_us = SELF_TEST_CLOCK_US / 20;
+    const struct {
+        int32_t ahead_us;
+        bool right;
+    } cases[] = {
+        {0, true},
+        {int32_t(tolerance_us), true},
+        {int32_t(tolerance_us) + 1, false},
+        {-int32_t(tolerance_us), true},
+        {-int32_t(tolerance_us) - 1, false},
+    };
+    for (const auto &each : cases) {
+        begin();
+        time_us += SELF_TEST_CLOCK_US;
+        hal.reference_us += SELF_TEST_CLOCK_US + uint32_t(each.ahead_us);
+        step();
+        EXPECT_EQ(test.failed, each.right ? 0u : SELF_TEST_CLOCK) << each.ahead_us;
+    }
+}
+
 TEST_F(SelfTest, the_clock_passes_again_when_it_is_right) {
     begin();
     run(1000000, 1.1);

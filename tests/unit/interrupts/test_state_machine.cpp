@@ -250,6 +250,23 @@ TEST_F(StateMachine, a_fault_is_cleared_when_its_cause_has_been_gone_for_ten_mil
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY) << "the request waits";
 }
 
+TEST_F(StateMachine, ten_milliseconds_begin_after_the_fault_itself_when_it_lasts_one_tick) {
+    for (const drive_state_t from : {DRIVE_STATE_READY, DRIVE_STATE_RUN}) {
+        state_machine_reset(&state_machine);
+        run();
+        if (from == DRIVE_STATE_READY) {
+            step(COMMAND_OFF);
+        }
+        ASSERT_EQ(state_machine.state, from);
+        ASSERT_EQ(step(COMMAND_OFF, FAULT_BIT(FAULT_OVER_VOLTAGE)), DRIVE_STATE_FAULT);
+        EXPECT_EQ(state_machine.fault_free_ticks, 0u) << "this tick has a failed check";
+        for (uint32_t k = 0; k < CAUSE_GONE_TICKS; k++) {
+            ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << k;
+        }
+        EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+    }
+}
+
 TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_request_to_clear) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));

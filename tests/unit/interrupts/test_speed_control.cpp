@@ -1,0 +1,94 @@
+// Speed control step: limits of the torque by a load that is uncertain, and the results outside of a run.
+#include <algorithm>
+#include <cstdint>
+#include <utility>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "interrupts/speed_control.h"
+}
+
+#include "support/configured.h"
+
+namespace {
+
+constexpr int32_t NM_Q24 = 1 << 24;
+
+class SpeedControl : public testing::Test {
+  protected:
+    SpeedControl() {
+        parameters = configured(DRIVE_CONTROLLER_SALIENT, 40000, 17);
+        control_reset(&parameters, &state);
+        parameters.conduction.torque_max_q24 = 32 * NM_Q24;
+    }
+
+    deferred_speed_results_t limited(int32_t load_q24, int32_t reference_q22) {
+        deferred_speed_results_t results = {reference_q22, 0, 0, -30 * NM_Q24, 30 * NM_Q24};
+        speed_control_limit_uncertain(&parameters, load_q24, &results);
+        return results;
+    }
+
+    control_parameters_t parameters;
+    control_state_t state;
+};
+
+TEST_F(SpeedControl, an_uncertain_load_is_not_braked_against_from_a_sixteenth_of_the_largest_torque_on) {
+    for (const int32_t sign : {1, -1}) {
+        for (const int32_t reference_q22 : {0, 1, 1 << 24}) { // in the direction in which the load brakes
+            for (const int32_t load_q24 : {NM_Q24, 2 * NM_Q24, 3 * NM_Q24}) {
+                const deferred_speed_results_t results = limited(sign * load_q24, sign * reference_q22);
+                const int32_t against_q24 = std::max(32 * NM_Q24 - 16 * load_q24, 0);
+                EXPECT_EQ(sign > 0 ? results.torque_min_q24 : -results.torque_max_q24, -against_q24);
+                EXPECT_EQ(sign > 0 ? results.torque_max_q24 : -results.torque_min_q24, 30 * NM_Q24);
+            }
+        }
+    }
+}
+
+TEST_F(SpeedControl, a_limit_of_the_torque_below_that_of_an_uncertain_load_stays) {
+    EXPECT_EQ(limited(1, 0).torque_min_q24, -30 * NM_Q24);
+    EXPECT_EQ(limited(-1, 0).torque_max_q24, 30 * NM_Q24);
+}
+
+TEST_F(SpeedControl, neither_no_load_nor_one_that_drives_limits_the_torque) {
+    for (const auto &[load_q24, reference_q22] :
+         {std::pair(0, 1), {0, 0}, {0, -1}, {3 * NM_Q24, -1}, {-3 * NM_Q24, 1}}) {
+        const deferred_speed_results_t results = limited(load_q24, reference_q22);
+        EXPECT_EQ(results.torque_min_q24, -30 * NM_Q24) << load_q24 << " " << reference_q22;
+        EXPECT_EQ(results.torque_max_q24, 30 * NM_Q24) << load_q24 << " " << reference_q22;
+    }
+}
+
+TEST_F(SpeedControl, every_result_is_0_outside_of_a_run_and_the_reference_also_in_torque_mode) {
+    deferred_input_t input{};
+    input.speed_q22 = 5 << 22;
+    input.dc_link_voltage_q6 = 240 << 6;
+    command_t command{};
+    command.request = COMMAND_RUN;
+    command.speed_reference_q22 = 50 << 22;
+    command.torque_reference_q24 = NM_Q24;
+    for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
+        command.mode = mode;
+        for (const bool run : {false, true}) {
+            state.deferred.run = true;
+            state.deferred.speed_reference_q22 = 20 << 22;
+            state.deferred.periodic_load.torque_q24 = 777;
+            input.run = run;
+            deferred_results_t results{};
+            results.speed = {1, 2, 3, 4, 5};
+            speed_control_deferred(&parameters, &state.deferred, &input, &command, 20 * NM_Q24, &results);
+            const bool speed_law = run && mode == DRIVE_MODE_SPEED;
+            EXPECT_EQ(results.speed.speed_reference_q22, speed_law ? state.deferred.speed_reference_q22 : 0);
+            EXPECT_EQ(results.speed.speed_reference_q22 != 0, speed_law);
+            EXPECT_EQ(results.speed.periodic_load_q24, speed_law ? 777 : 0);
+            if (!run) {
+                EXPECT_EQ(results.speed.speed_law_torque_q24, 0);
+                EXPECT_EQ(results.speed.torque_min_q24, 0);
+                EXPECT_EQ(results.speed.torque_max_q24, 0);
+            }
+        }
+    }
+}
+
+} // namespace
