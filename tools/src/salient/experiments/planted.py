@@ -152,7 +152,8 @@ def build_unchanged(finders: Sequence[str]) -> None:
     targets = {_target(finder) for finder in finders} - {CAMPAIGN}
     if CAMPAIGN in finders:
         targets |= {"salient_campaign", "salient_host"}
-    for command in (["cmake", "--preset", "host"], ["cmake", "--build", "--preset", "host", *(["--target", *targets] if targets else [])]):
+    named = ["--target", *targets] if targets else []
+    for command in (["cmake", "--preset", "host"], ["cmake", "--build", "--preset", "host", *named]):
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise UsageError(f"{shlex.join(command[:4])} fails: {done.stdout.strip()[-2000:]}")

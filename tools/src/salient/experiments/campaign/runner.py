@@ -48,6 +48,10 @@ def digest() -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()[:16]
 
 
+_RESULTS = ("docs", "tests/campaign", "tests/*.json", "tools/studies")
+"""Committed results and documents, of which one measurement changes those of another."""
+
+
 def commit() -> str:
     """Commit of the sources, with a plus when they differ from it."""
     def git(*arguments: str) -> str:
@@ -55,7 +59,9 @@ def commit() -> str:
         return done.stdout.strip() if done.returncode == 0 else ""
 
     known = git("rev-parse", "--short=10", "HEAD")
-    return f"{known}{'+' if git('status', '--porcelain', '--untracked-files=no') else ''}" if known else "unknown"
+    sources = [".", *(f":(exclude){name}" for name in _RESULTS)]
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", *sources)
+    return f"{known}{'+' if changed else ''}" if known else "unknown"
 
 
 def command(*options: object, programs: Programs | None = None) -> list[str]:
