@@ -229,8 +229,9 @@ def content(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 
 
 def _run(claim: Claim) -> None:
-    """Runs the command of a claim and keeps its summary, whatever that says."""
-    folder = OUT / "evidence" / claim.name
+    """Runs the command of a claim and keeps its summary, whatever that says. Its folder is of this commit alone: an
+    interrupted run goes on, and none takes over what another commit has left."""
+    folder = OUT / "evidence" / claim.name / (_git(ROOT, "rev-parse", "--short=10", "HEAD") or "unknown")
     make_folder(folder)
     arguments = [str(folder) if part == "{out}" else part for part in claim.command.split()]
     print(f"--- {claim.name}: {' '.join(arguments)}", flush=True)
