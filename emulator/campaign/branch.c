@@ -8,7 +8,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
-#include <sys/wait.h>
 #include <unistd.h>
 
 #include "campaign/drive_numbers.h"
@@ -182,8 +181,8 @@ static void branch_here(run_t *run) {
         if (is_slow(&branching.tallies[i]) && (branching.tick - setting->first) % slow_every != 0) {
             continue;
         }
-        const pid_t child = fork();
-        if (child == 0) {
+        unsigned signal;
+        if (run_fork(&signal)) {
             branching.child = true;
             branching.tally = &branching.tallies[i];
             branching.begin_ns = run->rig.board.time_ns;
@@ -193,14 +192,9 @@ static void branch_here(run_t *run) {
             begin_fault(run, &branching.variants[i]);
             return;
         }
-        int status;
-        if (child < 0 || waitpid(child, &status, 0) != child) {
-            perror("salient: fork");
-            exit(1);
-        }
-        if (WIFSIGNALED(status)) {
+        if (signal != 0) {
             branching.tallies[i].violations++;
-            snprintf(branching.tallies[i].rule, sizeof branching.tallies[i].rule, "crash %d", WTERMSIG(status));
+            snprintf(branching.tallies[i].rule, sizeof branching.tallies[i].rule, "crash %u", signal);
         }
     }
 }
@@ -233,16 +227,8 @@ static void before_interrupt(run_t *run) {
 }
 
 static void draw_world(world_t *world, const world_machine_t *machine, const branch_setting_t *setting) {
-    const double start_s =
-        machine->image.machine.inertia_kg_m2 * setting->speed_rpm * WORLD_RAD_S_PER_RPM / machine->torque_max_Nm;
-    *world = (world_t){.machine = machine,
-                       .controller = setting->controller,
-                       .control_rate_hz = 40000,
-                       .encoder_bits = 17,
-                       .adc_bits = 12,
-                       .kept = UINT64_MAX,
-                       .inertia_gain = 1.0};
-    branching.settled_ns = (uint64_t)((0.25 + 2.0 * start_s) * 1e9);
+    *world = world_plain(machine, setting->controller);
+    branching.settled_ns = (uint64_t)(world_settled_s(machine, setting->speed_rpm) * 1e9);
     world->duration_us = branching.settled_ns / 1000 + 10000000;
     world->event[world->events++] =
         (world_event_t){.kind = WORLD_SPEED, .value = setting->speed_rpm > 0.0 ? setting->speed_rpm : 150.0};

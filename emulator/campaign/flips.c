@@ -8,7 +8,6 @@
 #include <stdlib.h>
 #include <sys/mman.h>
 #include <sys/resource.h>
-#include <sys/wait.h>
 #include <unistd.h>
 
 #include "bench_variables.h"
@@ -127,19 +126,11 @@ static void flip_in_child(run_t *run, result_t *result, uint32_t bit, bool flips
 
 /* True in the child. */
 static bool branch(run_t *run, result_t *result, uint32_t bit, bool flips) {
-    fflush(stdout);
-    const pid_t child = fork();
-    if (child == 0) {
+    const bool child = run_fork(&result->signal);
+    if (child) {
         flip_in_child(run, result, bit, flips);
-        return true;
     }
-    int status;
-    if (child < 0 || waitpid(child, &status, 0) != child) {
-        perror("salient: fork");
-        exit(1);
-    }
-    result->signal = WIFSIGNALED(status) ? (unsigned)WTERMSIG(status) : 0;
-    return false;
+    return child;
 }
 
 static void before_interrupt(run_t *run) {
@@ -193,8 +184,8 @@ static void draw_standstill(world_t *world, bool armed) {
     world->duration_us = STOPPED_AT + OFF_FOR;
 }
 
-static void draw_run(world_t *world, double start_s) {
-    flipping.at_us = (uint64_t)((0.25 + 2.0 * start_s) * 1e6);
+static void draw_run(world_t *world, double speed_rpm) {
+    flipping.at_us = (uint64_t)(world_settled_s(world->machine, speed_rpm) * 1e6);
     const uint64_t off_us = flipping.at_us + RUN_FOR;
     add_load(world, flipping.at_us - SETTLED_FOR);
     add(world, WORLD_REQUEST, WORLD_REQUEST_OFF, 0.0, off_us, NEVER_US);
@@ -210,15 +201,7 @@ static void draw_fault(world_t *world) {
 
 static void draw_world(world_t *world, const world_machine_t *machine, const flips_setting_t *setting) {
     const double speed_rpm = SPEED_BASE * machine->speed_base_rpm;
-    const double start_s =
-        machine->image.machine.inertia_kg_m2 * speed_rpm * WORLD_RAD_S_PER_RPM / machine->torque_max_Nm;
-    *world = (world_t){.machine = machine,
-                       .controller = setting->controller,
-                       .control_rate_hz = 40000,
-                       .encoder_bits = 17,
-                       .adc_bits = 12,
-                       .kept = UINT64_MAX,
-                       .inertia_gain = 1.0};
+    *world = world_plain(machine, setting->controller);
     add(world, WORLD_SPEED, 0, speed_rpm, 0, NEVER_US);
     switch (setting->state) {
     case FLIPS_READY:
@@ -226,7 +209,7 @@ static void draw_world(world_t *world, const world_machine_t *machine, const fli
         draw_standstill(world, setting->state == FLIPS_ARMED);
         break;
     case FLIPS_RUN:
-        draw_run(world, start_s);
+        draw_run(world, speed_rpm);
         break;
     case FLIPS_FAULT:
     default:

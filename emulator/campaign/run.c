@@ -1,4 +1,11 @@
+#define _DEFAULT_SOURCE
+
 #include "campaign/run.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 #include "rig/heat.h"
 
@@ -94,4 +101,19 @@ void run_to_end(run_t *run) {
     checkers_at_end(&run->checkers,
                     (observation_heat_t){heat_winding_C(&run->rig.heat), heat_inverter_C(&run->rig.heat)});
     rig_close(&run->rig);
+}
+
+bool run_fork(unsigned *signal) {
+    fflush(stdout);
+    const pid_t child = fork();
+    if (child == 0) {
+        return true;
+    }
+    int status;
+    if (child < 0 || waitpid(child, &status, 0) != child) {
+        perror("salient: fork");
+        exit(1);
+    }
+    *signal = WIFSIGNALED(status) ? (unsigned)WTERMSIG(status) : 0;
+    return false;
 }

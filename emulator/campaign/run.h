@@ -29,6 +29,10 @@ typedef struct run {
  * frames: the clients' true state and hash are wanted. */
 bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE *record);
 
+/* Forks the process with its run: true in the child. False in the parent once the child has ended, with the signal that
+ * ended it, 0 for none; without a child the process ends. */
+bool run_fork(unsigned *signal);
+
 /* Runs to end_ns, and judges what is judged at the end. */
 void run_to_end(run_t *run);
 

@@ -13,6 +13,24 @@ static int32_t raw_of(unsigned variable, double value) {
                          bench_variables[variable].raw_maximum);
 }
 
+world_t world_plain(const world_machine_t *machine, unsigned controller) {
+    return (world_t){
+        .machine = machine,
+        .controller = controller,
+        .control_rate_hz = 40000,
+        .encoder_bits = 17,
+        .adc_bits = 12,
+        .kept = UINT64_MAX,
+        .inertia_gain = 1.0,
+    };
+}
+
+double world_settled_s(const world_machine_t *machine, double speed_rpm) {
+    const double start_s =
+        machine->image.machine.inertia_kg_m2 * speed_rpm * WORLD_RAD_S_PER_RPM / machine->torque_max_Nm;
+    return 0.25 + 2.0 * start_s;
+}
+
 world_event_t *world_add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us) {
     if (world->events == WORLD_EVENTS_MAX) {
         return NULL;

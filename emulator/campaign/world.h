@@ -84,6 +84,12 @@ typedef struct {
     uint64_t kept; /* bit n: event n happens */
 } world_t;
 
+/* A world without events and faults, whose drive has the usual board: 40 kHz, sensors of 12 and 17 bits. */
+world_t world_plain(const world_machine_t *machine, unsigned controller);
+
+/* Time in s after which a start from rest to a speed has settled: twice that at the largest torque, and 0.25 s. */
+double world_settled_s(const world_machine_t *machine, double speed_rpm);
+
 /* Adds an event; NULL: there is no room. */
 world_event_t *world_add(world_t *world, world_kind_t kind, uint64_t begin_us, uint64_t end_us);
 
