@@ -247,10 +247,16 @@ class Drive : public testing::Test {
     void command(command_request_t request, double reference_rpm = 600.0) {
         send(request, reference_rpm);
         if (request == COMMAND_RUN && !drive.comms.commands.arming.armed) {
-            hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
-            periods(10);
-            hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+            arm_for_run(7);
         }
+    }
+
+    // The sender's arming for a run, but the effect of its last frame.
+    void arm_for_run(uint8_t arming_counter) {
+        hal.to_drive.push_back(frames::arm(arming_counter, ARMING_STEP_REQUEST_RUN));
+        periods(10);
+        hal.to_drive.push_back(
+            frames::arm(uint8_t(arming_counter + 1), ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
     }
 
     void send(command_request_t request, double reference_rpm = 600.0) {
@@ -560,9 +566,7 @@ TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
 TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     send(COMMAND_OFF);
-    hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
-    periods(10);
-    hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    arm_for_run(7);
     periods(10);
     ASSERT_TRUE(drive.comms.commands.arming.armed);
     ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
@@ -1262,9 +1266,7 @@ TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_se
     periods(20000);
     // A run.
     send(COMMAND_OFF);
-    hal.to_drive.push_back(frames::arm(1, ARMING_STEP_REQUEST_RUN));
-    periods(10);
-    hal.to_drive.push_back(frames::arm(2, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    arm_for_run(1);
     periods(10);
     arm();
     send(COMMAND_RUN);
@@ -1310,9 +1312,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
     periods(100);
     // Armed for a run by commands other than run.
     send(COMMAND_OFF);
-    hal.to_drive.push_back(frames::arm(1, ARMING_STEP_REQUEST_RUN));
-    periods(10);
-    hal.to_drive.push_back(frames::arm(2, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    arm_for_run(1);
     periods(10);
     ASSERT_TRUE(drive.comms.commands.arming.armed);
     // The set and the command to run wait together: one call of the background takes apply and command.
