@@ -222,7 +222,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                        "exit code 1 when a property is violated")
     campaign.add_argument("--seeds", type=_seeds, default=1000, metavar="N", help="number of seeds (default 1000)")
     campaign.add_argument("--first", type=_seed, default=1, metavar="SEED", help="the first one (default 1)")
-    campaign.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
+    campaign.add_argument("--shard", type=shard, default=(1, 1), metavar="I/N",
                           help="every N-th seed only, beginning with the I-th; shards may share a folder")
     campaign.add_argument("--scheduler", metavar="ADDRESS",
                           help="Dask scheduler, tcp://HOST:PORT, whose workers have this installation")
@@ -391,7 +391,7 @@ def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true",
                         help="keep the finished runs in the folder; those of shards are always kept")
     _add_execution_options(parser)
-    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N",
+    parser.add_argument("--shard", type=shard, default=(1, 1), metavar="I/N",
                         help="only the I-th of N parts; keeps the finished runs in the folder")
 
 
@@ -401,7 +401,8 @@ def _add_execution_options(parser: argparse.ArgumentParser) -> None:
                         help="Dask scheduler whose workers run them instead: tcp://HOST:PORT")
 
 
-def _shard(text: str) -> tuple[int, int]:
+def shard(text: str) -> tuple[int, int]:
+    """I/N, whole numbers with I from 1 to N."""
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise argparse.ArgumentTypeError(f"{text}: must be I/N, whole numbers with I from 1 to N")

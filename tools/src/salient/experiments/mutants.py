@@ -139,20 +139,16 @@ def finders(file: str) -> tuple[str, ...]:
     """Programs of unit tests that judge a source: its own, those that include its header, the whole drive."""
     header = file.partition("/")[2].removesuffix(".c") + ".h"
     own = "test_" + header.removesuffix(".h").replace("/", "_")
-    found = [_program(path) for path in sorted(planted.UNIT.rglob("test_*.cpp"))
+    found = [planted.unit_program(path) for path in sorted(planted.UNIT.rglob("test_*.cpp"))
              if f'#include "{header}"' in path.read_text(encoding="utf-8")]
-    parts = _parts("host")
-    return tuple(dict.fromkeys(program for program in (own, *found, _WHOLE_DRIVE) if program in parts))
-
-
-def _program(source: Path) -> str:
-    return "_".join(["test", *source.relative_to(planted.UNIT).parent.parts, source.stem.removeprefix("test_")])
+    built = _built()
+    return tuple(dict.fromkeys(program for program in (own, *found, _WHOLE_DRIVE) if program in built))
 
 
 @cache
-def _parts(preset: str) -> frozenset[str]:
-    """Programs of unit tests in the build folder of a preset."""
-    return frozenset(path.name for path in (BUILD / preset / "bin").glob("test_*"))
+def _built() -> frozenset[str]:
+    """Programs of unit tests in the build folder."""
+    return frozenset(path.name for path in (BUILD / "host" / "bin").glob("test_*"))
 
 
 def _limit() -> None:

@@ -136,8 +136,12 @@ def check_finders(bug: Bug) -> None:
 
 def unit_source(program: str) -> Path | None:
     """Source of a program of unit tests, test_FOLDER_NAME or test_NAME."""
-    return next((path for path in UNIT.rglob("test_*.cpp") if program == "_".join(
-        ["test", *path.relative_to(UNIT).parent.parts, path.stem.removeprefix("test_")])), None)
+    return next((path for path in UNIT.rglob("test_*.cpp") if program == unit_program(path)), None)
+
+
+def unit_program(source: Path) -> str:
+    """Program of a source of unit tests."""
+    return "_".join(["test", *source.relative_to(UNIT).parent.parts, source.stem.removeprefix("test_")])
 
 
 # --- Build ----------------------------------------------------------------------------------------------------------

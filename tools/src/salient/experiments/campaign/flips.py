@@ -3,9 +3,9 @@
     python -m salient.experiments.campaign.flips DIR [--stride N] [--seed S] [--shard I/N] [--jobs N] [--page FILE]
 
 brings the drive into each state and flips each N-th bit of drive_t there (emulator/campaign/flips.h), from a first one
-that the seed chooses, and with salient every bit of the members that
-decide whether it runs. Results go to DIR, where an interrupted run goes on; DIR/summary.json has the counts, and the
-members in which a flip is not safe. --page writes them as a page. Exit code 1 when a flip is unsafe.
+that the seed chooses, and with salient every bit of the members that decide whether it runs. Results go to DIR, where
+an interrupted run goes on; DIR/summary.json has the counts, and the members in which a flip is not safe. --page writes
+them as a page. Exit code 1 when a flip is unsafe.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from salient.cli import shard
 from salient.errors import UsageError, exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.arguments import count
@@ -198,26 +199,19 @@ def page(note: dict[str, Any]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def shard(text: str) -> tuple[int, int]:
-    """I/N with 1 <= I <= N."""
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UsageError(f"--shard {text}: must be I/N with I from 1 to N")
-    return int(match[1]), int(match[2])
-
-
 def main(arguments: list[str]) -> int:
     parser = parser_of("flips", __doc__)
     parser.add_argument("--stride", type=count, default=STRIDE, metavar="N",
                         help=f"every N-th bit, odd (default {STRIDE}; 1: all of them)")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the first bits (default 1)")
-    parser.add_argument("--shard", default="1/1", metavar="I/N", help="every N-th chunk of bits, from the I-th on")
+    parser.add_argument("--shard", type=shard, default=(1, 1), metavar="I/N",
+                        help="every N-th chunk of bits, from the I-th on")
     parser.add_argument("--jobs", type=count, metavar="N", help="simultaneous runs (default: number of cores)")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the counts as a page")
     options = parser.parse_args(arguments)
     layout = Layout(program())
     listed = tasks(options.stride, options.seed, layout)
-    results = [result for _, result in run(listed, serve, options.out, shard(options.shard), jobs=options.jobs)]
+    results = [result for _, result in run(listed, serve, options.out, options.shard, jobs=options.jobs)]
     note = summary(results, layout, options.stride, options.seed)
     (options.out / "summary.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     for part in PARTS:
