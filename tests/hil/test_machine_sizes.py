@@ -10,8 +10,7 @@ import pytest
 
 from salient.bench.drive import DriveError
 from salient.bench.session import Session
-from salient.bus.signals import load_database
-from salient.dbc import database_hash
+from salient.dbc import database_hash, load_database
 from salient.errors import UsageError
 from salient.machine import cache
 from salient.machine.parameter_table import read_table

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from salient.bus.e2e import check, data_id, protect
-from salient.bus.signals import drive_database, load_database, rig_database
+from salient.bus.signals import drive_database, rig_database
 from salient.config import NODE_MAX
-from salient.dbc import RIG_OF_ALL, attributes
+from salient.dbc import RIG_OF_ALL, attributes, load_database
 from salient.machine.report import run
 
 NODES = range(NODE_MAX + 1)

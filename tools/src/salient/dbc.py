@@ -7,11 +7,22 @@ import json
 import re
 import zlib
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
+import cantools
 from cantools.database.can.database import Database
 from cantools.database.can.message import Message
 from cantools.database.can.signal import Signal
+
+
+@lru_cache
+def load_database(path: Path) -> Database:
+    """A DBC file, loaded once."""
+    database = cantools.database.load_file(path, strict=True)
+    assert isinstance(database, Database)  # as every DBC gives
+    return database
 
 
 def attributes(owner: Message | Signal) -> dict[str, Any]:

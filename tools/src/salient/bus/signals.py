@@ -7,7 +7,6 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import can
 import cantools
@@ -22,14 +21,6 @@ from salient.paths import DRIVE_DBC, RIG_DBC
 
 FrameKey = tuple[int, bool]
 _TIME_BYTES, _WORD_BYTES = 8, 8
-
-
-@lru_cache
-def load_database(path: Path) -> Database:
-    """A DBC file, loaded once."""
-    database = cantools.database.load_file(path, strict=True)
-    assert isinstance(database, Database)  # as every DBC gives
-    return database
 
 
 @lru_cache

@@ -11,10 +11,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import cantools
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Message, Signal
 
-from salient.dbc import attributes
+from salient.dbc import attributes, load_database
 from salient.generate.files import cell
 from salient.paths import DRIVE_DBC, REFERENCE, RIG_DBC, ROOT
 
@@ -80,13 +79,7 @@ def _section(message: Message) -> str:
 def pages() -> dict[Path, str]:
     """The text of each page."""
     return {of.path: _HEAD.format(title=of.title, source=of.source.relative_to(ROOT), text=of.text)
-            + "".join(map(_section, _messages(of.source))) for of in (DRIVE, RIG)}
-
-
-def _messages(source: Path) -> list[Message]:
-    database = cantools.database.load_file(source)
-    assert isinstance(database, Database)  # as every DBC gives
-    return database.messages
+            + "".join(map(_section, load_database(of.source).messages)) for of in (DRIVE, RIG)}
 
 
 def main() -> int:
