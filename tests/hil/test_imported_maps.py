@@ -9,9 +9,7 @@ Its points are not those of the motor's own map: how coarse they are costs rippl
 from __future__ import annotations
 
 import math
-import struct
 import tomllib
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,7 @@ from salient.experiments.compare.random_maps import random_map
 from salient.machine.drive_data import derive
 from salient.machine.file import Machine, load_machine, machine_path
 from salient.machine.flux_map import FluxMap
-from salient.machine.image import FLUX_MAP, HEADER, LAYOUT, MAGIC, PLANT, TABLES, firmware_tables
+from salient.machine.image import FLUX_MAP, PLANT, TABLES, firmware_tables, joined
 from salient.machine.map_import.command import import_map, with_map
 from salient.machine.scaling import scaling_of
 
@@ -31,7 +29,6 @@ RATIO_MAX_OF_A_SHIFTED_HALF = 2.6
 """Half a pitch shows its origin by the slope at one end alone: 0.03 degrees are left of a shift."""
 RIPPLE_MAX = 0.010  # below it no ratio is judged, as in compare
 PARTS_OF_BASE = (0.05, 1.0)
-CHECKED_FROM = 16
 ANGLES, CURRENTS = 91, 20
 KINDS = ("0.5 deg off", "2 deg off", "phases differ", "halves differ", "half a pitch, 0.5 deg off")
 
@@ -89,14 +86,12 @@ def image_of(drive: Path, motor: Machine) -> bytes:
     """The machine image of a drive of one file with another motor."""
     machine = load_machine(drive)
     scaling = scaling_of(drive, machine)
-    parts = [
+    return joined([
         TABLES.packed(machine, scaling, firmware_tables(drive, machine, scaling)),
         PLANT.packed(motor, scaling),
         FLUX_MAP.packed(motor.magnetics) if isinstance(motor.magnetics, FluxMap) else b"",
         machine.name.encode("ascii") + b"\0",
-    ]
-    checked = HEADER.pack(b"", 0, 0, *map(len, parts))[CHECKED_FROM:] + b"".join(parts)
-    return MAGIC + struct.pack("<II", LAYOUT, zlib.crc32(checked)) + checked
+    ])
 
 
 def ripple(make_bench, folder: Path, drive: Path, motor: Machine, of_base: float) -> float:
