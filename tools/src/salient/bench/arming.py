@@ -11,12 +11,20 @@ from salient.bus.signals import drive_database, value_numbers
 
 _ARM = drive_database().get_message_by_name("DRIVE_ARM")
 _REPORT = "DRIVE_ARMING"
+_STATUS = drive_database().get_message_by_name("DRIVE_STATUS")
+assert _STATUS.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 STEPS = value_numbers(drive_database(), "DRIVE_ARM", "step")
 ATTEMPTS = value_numbers(drive_database(), "DRIVE_ARMING", "attempt")
 
 RETRY_NS = 500_000_000
-"""Time without a challenge or its result after which the request is repeated: that in which a challenge is valid."""
+"""Time without a challenge or its result after which the request is repeated: that in which a challenge is valid. It
+passes for the session and for the drive, by the frames that it has sent: in slow motion on SocketCAN, where a session
+has the time of the interface, the drive's result takes longer, and a request that is repeated too early makes it
+void."""
+_RETRY_FRAMES = RETRY_NS // (_STATUS.cycle_time * 1_000_000)
 ATTEMPTS_MAX = 4
+_SILENCE_MAX_NS = ATTEMPTS_MAX * RETRY_NS
+"""A drive that has sent nothing for so long is off, and must not be armed when it is switched on."""
 _FAST_POLL_NS = 50_000
 _FAST_POLL_FOR_NS = 2_000_000
 _SLOW_POLL_NS = 1_000_000
@@ -34,7 +42,8 @@ def response_to(challenge: int) -> int:
 
 
 class ArmingSequence:
-    """Arms a drive as virtual time advances: call `step` at `due_ns`."""
+    """Arms a drive as virtual time advances: call `step` at `due_ns`. given_up: the drive has not taken ATTEMPTS_MAX
+    requests, or has been silent for 2 s."""
 
     due_ns: int
     armed: bool
@@ -61,12 +70,13 @@ class ArmingSequence:
             self._seen = count
             self._take_report()
         elapsed_ns = self._session.time_ns - self._sent_ns
-        if elapsed_ns >= RETRY_NS and not self.armed:
-            if self._attempts == ATTEMPTS_MAX:
-                self.given_up = True
-                return
+        frames = self._session.telemetry.count(_STATUS.name) - self._frames
+        is_over = self._refused or (elapsed_ns >= RETRY_NS and frames >= _RETRY_FRAMES)
+        if is_over and not self.armed and self._attempts < ATTEMPTS_MAX:
             self._request()
             elapsed_ns = 0
+        elif is_over or (elapsed_ns >= _SILENCE_MAX_NS and not frames):
+            self.given_up = not self.armed
         self.due_ns = self._session.time_ns + (_FAST_POLL_NS if elapsed_ns < _FAST_POLL_FOR_NS else _SLOW_POLL_NS)
 
     def _take_report(self) -> None:
@@ -79,12 +89,14 @@ class ArmingSequence:
             self._answered = challenge
             self._send("confirm_run", response_to(challenge))
         elif not attempt and self._answered is not None:
-            self._sent_ns -= RETRY_NS  # the response was refused
+            self._refused = True
 
     def _request(self) -> None:
         self._attempts += 1
         self._answered = None
+        self._refused = False
         self._sent_ns = self._session.time_ns
+        self._frames = self._session.telemetry.count(_STATUS.name)
         self._send("request_run")
         self.due_ns = self._sent_ns + _FAST_POLL_NS
 

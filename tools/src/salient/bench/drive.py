@@ -109,6 +109,7 @@ class Drive(KnownAttributes):
         self._counter = 0
         self._arming: ArmingSequence | None = None
         self._arming_counter = 0
+        self._arming_given_up = False
         self._disarmed_ns: int | None = None
         self.command_due_ns = None
         self.lowest_speed_rpm = 0.0
@@ -185,6 +186,7 @@ class Drive(KnownAttributes):
             *most, last = REQUESTS
             raise DriveError(f"request '{request}': must be {', '.join(most)} or {last}")
         self._request = request
+        self._arming_given_up = False
         if request == "run":
             self._require_drive_database()
             if self._arming is None and not self.armed:
@@ -217,6 +219,7 @@ class Drive(KnownAttributes):
             if self._arming.armed:
                 self._disarmed_ns = None
             if self._arming.armed or self._arming.given_up:
+                self._arming_given_up = self._arming.given_up
                 self._end_arming()
 
     def _end_arming(self) -> None:
@@ -265,6 +268,16 @@ class Drive(KnownAttributes):
     def start_inhibited_by(self) -> str:
         """Name of the check that keeps the drive in state initialise, or none, by its latest telemetry."""
         return self._session.telemetry["DRIVE_STATUS.start_inhibited_by"].last_name
+
+    @property
+    def hindrance(self) -> str:
+        """Why the drive does not run though it has no fault, by its latest telemetry: a check that fails, or an arming
+        without a result. Empty when nothing is known to hinder it."""
+        if self.state == "initialise" and self.start_inhibited_by not in ("none", "unknown"):
+            return f"not ready: its check {self.start_inhibited_by} fails"
+        if self._arming_given_up:
+            return "not armed: the requests to arm were refused or had no answer"
+        return ""
 
     def fault_trace(self) -> FaultTrace:
         """The control periods before the last fault; kept until the drive runs again. See read_fault_trace."""

@@ -205,15 +205,13 @@ def plot_moment(session: Session, time_s: float, title: str, path: Path,
 
 
 def _drive(session: Session, fault: tuple[float, str] | None, acts: Sequence[Stimulus]) -> str:
-    """The first fault of the drive, with the act before it; else the check that keeps it from running."""
+    """The first fault of the drive, with the act before it; else its hindrance."""
     if fault is not None:
         time_s, name = fault
         before = last_before(acts, time_s)
         since = "" if before is None else f", {1e3 * (time_s - before.time_s):.3f} ms after {before.text}"
         return f"tripped: {name}, reported at {time_s:.6f} s{since}"
-    if session.telemetry["DRIVE_STATUS.state"].last_name == "initialise":
-        return f"not ready: its check {session.telemetry['DRIVE_STATUS.start_inhibited_by'].last_name} fails"
-    return ""
+    return session.drive.hindrance
 
 
 def _last(acts: Sequence[Stimulus], moment_s: float, title: str) -> str:

@@ -237,8 +237,8 @@ class Session(KnownAttributes):
         step_ns = _nanoseconds("run_until: step_s", step_s, least_s=1e-9)
         while not condition():
             if self.time_ns >= deadline_ns:
-                held = self.drive.start_inhibited_by
-                reason = "" if held in ("none", "unknown") else f"; the drive is not ready: its check {held} fails"
+                hindrance = self.drive.hindrance
+                reason = f"; the drive is {hindrance}" if hindrance else ""
                 raise AssertionError(f"condition not met within {timeout:g} s, at {self.time_s:g} s of virtual time"
                                      f"{reason}")
             self.advance_to(min(deadline_ns, self.time_ns + step_ns))
