@@ -266,5 +266,8 @@ commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_ca
         }
         return COMMANDS_PARAMETER_REQUEST;
     }
+    if (frame->identifier == DRIVE_XCP_COMMAND_FRAME_ID) {
+        return COMMANDS_XCP;
+    }
     return reject(&counters->unknown_frame);
 }

@@ -5,7 +5,9 @@
 #include "comms/node.h"
 #include "comms/parameter_protocol.h"
 #include "comms/trace_protocol.h"
+#include "comms/xcp.h"
 #include "drive_codec.h"
+#include "fixed/compiler.h"
 
 #define US_PER_MS 1000u
 
@@ -58,6 +60,27 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
     }
 }
 
+/* Frames of XCP that are no response to a single command: those of an upload wait with the responses, those of a
+ * measurement are for a bus on which the drive has nothing else to send. */
+COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parameters) {
+    hal_can_frame_t frame;
+    while (comms->xcp.upload_left > 0 && frame_queue_free(&comms->responses) > 1u &&
+           xcp_next_frame(&comms->xcp, parameters, true, &frame)) {
+        frame.identifier += comms->telemetry.identifier_offset;
+        frame_queue_push(&comms->responses, &frame);
+    }
+    if (!comms->xcp.daq.running || frame_queue_peek(&comms->telemetry.queue) != NULL ||
+        frame_queue_peek(&comms->responses) != NULL) {
+        return;
+    }
+    hal_can_status_t status;
+    hal_can_status(hal, &status);
+    if (xcp_next_frame(&comms->xcp, parameters, status.transmitting, &frame)) {
+        frame.identifier += comms->telemetry.identifier_offset;
+        hal_can_transmit(hal, &frame);
+    }
+}
+
 /* Handles a parameter request or a frame of a set. Without room for its response a frame is dropped: commands behind it
  * must not wait. */
 static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *parameters,
@@ -85,6 +108,20 @@ static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *paramet
     frame_queue_push(&comms->responses, &response);
 }
 
+static void receive_xcp(comms_t *comms, hal_t *hal, parameters_t *parameters,
+                        const parameters_conditions_t *conditions, const hal_can_frame_t *frame, uint32_t time_us) {
+    if (frame_queue_free(&comms->responses) == 0) {
+        counter_add(&comms->telemetry.dropped, 1);
+        return;
+    }
+    const xcp_context_t context = {parameters, conditions, &comms->set, comms->store};
+    hal_can_frame_t response;
+    if (xcp_receive(&comms->xcp, hal, frame, &context, time_us, &response)) {
+        response.identifier += comms->telemetry.identifier_offset;
+        frame_queue_push(&comms->responses, &response);
+    }
+}
+
 static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
                     uint32_t timeout_us, uint32_t time_us) {
     hal_can_frame_t frame;
@@ -106,6 +143,9 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
         case COMMANDS_PARAMETER_SET:
             receive_parameters(comms, hal, parameters, conditions, &frame);
             break;
+        case COMMANDS_XCP:
+            receive_xcp(comms, hal, parameters, conditions, &frame, time_us);
+            break;
         case COMMANDS_ACCEPTED:
         case COMMANDS_REJECTED:
             bus_monitor_check(&comms->bus, &frame, time_us);
@@ -121,6 +161,7 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, cons
                       drive_state_t state, uint32_t time_us) {
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
+    xcp_supervise(&comms->xcp, comms->bus.status.state == HAL_CAN_BUS_OFF, time_us);
     comms->set.begun = comms->set.begun && comms->commands.arming.configuring;
     telemetry_set_period(&comms->telemetry, DRIVE_TELEMETRY_RATE_FAST,
                          (unsigned)parameters->values[PARAMETER_TELEMETRY_PERIOD_MS]);
@@ -128,6 +169,7 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, cons
                          (unsigned)parameters->values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS]);
     const bool commanded = receive(comms, hal, parameters, conditions, timeout_us, time_us);
     flush(comms, hal, time_us);
+    send_xcp(comms, hal, parameters);
     return commanded;
 }
 

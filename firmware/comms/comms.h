@@ -24,6 +24,7 @@
 #include "comms/frame_queue.h"
 #include "comms/parameter_set.h"
 #include "comms/telemetry.h"
+#include "comms/xcp.h"
 #include "hal_can.h"
 #include "interrupts/control_step.h"
 #include "interrupts/fault_trace.h"
@@ -46,6 +47,7 @@ typedef struct {
     frame_queue_t responses; /* to parameter requests and steps of a set */
     bool response_first;     /* one may pass ahead of telemetry in this cycle */
     parameter_set_t set;     /* staged */
+    xcp_t xcp;               /* initialised by the caller after comms_init */
     command_t command;       /* last accepted command */
     nvm_store_t *store;      /* this and the next three are set by the caller after comms_init */
     const fault_trace_t *trace;

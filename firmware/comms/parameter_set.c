@@ -14,12 +14,16 @@ static void begin(parameter_set_t *set, const parameters_t *parameters, bool def
     set->sum = parameters_sum(set->values);
 }
 
+static void stage(parameter_set_t *set, unsigned index, int32_t value) {
+    set->sum += (uint32_t)value - (uint32_t)set->values[index];
+    set->values[index] = value;
+    set->written |= UINT64_C(1) << index;
+}
+
 void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame) {
     struct drive_parameter_write_t message;
     drive_parameter_write_unpack(&message, frame->data, frame->length);
-    set->sum += (uint32_t)message.value - (uint32_t)set->values[message.index];
-    set->values[message.index] = message.value;
-    set->written |= UINT64_C(1) << message.index;
+    stage(set, message.index, message.value);
     set->crc = crc32_continue(set->crc, frame->data + E2E_HEADER_BYTES, frame->length - E2E_HEADER_BYTES);
 }
 
@@ -35,6 +39,18 @@ static parameters_verdict_t apply(const parameter_set_t *set, uint32_t crc, para
     if (verdict.status == PARAMETER_STATUS_DONE) {
         parameters_apply(parameters, set->values);
     }
+    return verdict;
+}
+
+parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *parameters,
+                                       const parameters_conditions_t *conditions, unsigned index, int32_t value) {
+    if (!parameters_intact(parameters)) {
+        return (parameters_verdict_t){PARAMETER_STATUS_MEMORY, 0, 0};
+    }
+    begin(set, parameters, false);
+    stage(set, index, value);
+    const parameters_verdict_t verdict = apply(set, set->crc, parameters, conditions);
+    set->begun = false;
     return verdict;
 }
 

@@ -32,6 +32,11 @@ typedef struct {
 /* Takes a PARAMETER_WRITE that has passed commands_receive. [background] */
 void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame);
 
+/* Stages, checks and applies a set of one parameter, index 0..PARAMETER_COUNT-1, in place of a staged one. [background]
+ */
+parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *parameters,
+                                       const parameters_conditions_t *conditions, unsigned index, int32_t value);
+
 /* Executes a PARAMETER_SET_CONTROL that has passed commands_receive and writes its response. armed: for configuration.
  * True when that state ends. [background] */
 bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *parameters, nvm_store_t *store,

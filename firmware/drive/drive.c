@@ -74,6 +74,7 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     drive->comms.trace = &drive->trace;
     drive->comms.self_test = &drive->self_test;
     drive->comms.control_parameters = &drive->control_parameters;
+    xcp_init(&drive->comms.xcp, drive, DRIVE_WORDS, &drive->sampler);
     table_scale_reset(&drive->table_scale);
     configure(drive);
     control_reset(&drive->control_parameters, &drive->control);
@@ -131,6 +132,9 @@ void drive_control_interrupt(drive_t *drive) {
     if (drive->control.deferred_request.skipped == 0) {
         hal_interrupt_request_deferred(drive->hal);
     }
+    if (drive->sampler.event == SAMPLER_EVENT_CONTROL) {
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, sample.time_us);
+    }
     drive->used_ticks = hal_interrupt_elapsed_ticks(drive->hal);
     if (drive->used_ticks > drive->worst_ticks) {
         drive->worst_ticks = drive->used_ticks;
@@ -156,6 +160,9 @@ void drive_deferred_interrupt(drive_t *drive) {
         return;
     }
     deferred_compute(&drive->control_parameters, control, &drive->command);
+    if (drive->sampler.event == SAMPLER_EVENT_DEFERRED) {
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, hal_time_us(drive->hal));
+    }
     drive->deferred_used_ticks = deferred_elapsed_ticks(drive);
     if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
         drive->deferred_worst_ticks = drive->deferred_used_ticks;
@@ -308,6 +315,9 @@ COLD void drive_background(drive_t *drive) {
         take_command(drive);
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
+    if (drive->sampler.event == SAMPLER_EVENT_BACKGROUND) {
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
+    }
     ramp_down(drive, time_us);
     drop_unarmed_command(drive);
     kick_watchdog(drive, time_us);

@@ -2,6 +2,7 @@
 #ifndef DRIVE_DRIVE_H
 #define DRIVE_DRIVE_H
 
+#include <assert.h>
 #include <stdbool.h>
 #include <stdint.h>
 
@@ -13,6 +14,7 @@
 #include "interrupts/configure.h"
 #include "interrupts/control_step.h"
 #include "interrupts/fault_trace.h"
+#include "interrupts/sampler.h"
 #include "interrupts/self_test.h"
 #include "monitors/available_torque.h"
 #include "monitors/flux_monitor.h"
@@ -77,7 +79,12 @@ typedef struct {
     /* Written by the control interrupt. Last because it is large: loads and stores reach a limited offset in one
      * instruction. */
     fault_trace_t trace;
+    /* Written by the context of its event, and by the background while it has none. */
+    sampler_t sampler;
 } drive_t;
+
+static_assert(sizeof(drive_t) % sizeof(uint32_t) == 0, "the sampler and XCP read words");
+#define DRIVE_WORDS (sizeof(drive_t) / sizeof(uint32_t))
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a node number above NODE_MAX and
  * for a control rate that the timer's clock (hal_pwm.h) cannot make or that is too low for the machine

@@ -1,0 +1,277 @@
+#include "comms/xcp.h"
+
+#include "comms/arming.h"
+#include "comms/xcp_daq.h"
+#include "comms/xcp_memory.h"
+#include "control/machine_tables.h"
+#include "drive_codec.h"
+#include "hal_random.h"
+#include "layout_hash.h"
+
+enum {
+    DOWNLOAD = 0xF0,
+    SHORT_UPLOAD = 0xF4,
+    UPLOAD = 0xF5,
+    SET_MTA = 0xF6,
+    UNLOCK = 0xF7,
+    GET_SEED = 0xF8,
+    SET_REQUEST = 0xF9,
+    GET_ID = 0xFA,
+    GET_COMM_MODE_INFO = 0xFB,
+    SYNCH = 0xFC,
+    GET_STATUS = 0xFD,
+    DISCONNECT = 0xFE,
+    CONNECT = 0xFF,
+};
+
+enum { RESPONSE = 0xFF, ERROR = 0xFE };
+enum { MESSAGE_BYTES = 8, DATA_BYTES = MESSAGE_BYTES - 1, DOWNLOAD_BYTES = MESSAGE_BYTES - 2, KEY_BYTES = 4 };
+
+#define RESOURCES (XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ)
+#define COMM_MODE 0xC0u     /* low byte first, addresses of bytes, UPLOAD in blocks, more by GET_COMM_MODE_INFO */
+#define PROTOCOL_VERSION 1u /* of protocol and transport layer */
+#define STORE_CAL 0x01u
+#define STATUS_DAQ 0x40u
+#define DRIVER_VERSION 0x10u
+
+typedef struct {
+    uint8_t data[MESSAGE_BYTES];
+    uint8_t length;
+} message_t;
+
+static char *append_hexadecimal(char *at, uint32_t value) {
+    for (int shift = 28; shift >= 0; shift -= 4) {
+        *at++ = "0123456789abcdef"[value >> shift & 0xFu];
+    }
+    return at;
+}
+
+/* "salient" and, in hexadecimal, hashes of the headers and of the machine's DBC and the size of the memory, which
+ * differs with the processor. */
+static void identify(xcp_t *xcp) {
+    static const char name[] = "salient";
+    char *at = xcp->text;
+    for (unsigned i = 0; name[i] != '\0'; i++) {
+        *at++ = name[i];
+    }
+    at = append_hexadecimal(at, LAYOUT_HASH);
+    at = append_hexadecimal(at, machine_tables.dbc_hash);
+    append_hexadecimal(at, xcp->words);
+}
+
+void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {
+    *xcp = (xcp_t){.memory = memory, .words = words, .sampler = sampler};
+    identify(xcp);
+}
+
+static void end_session(xcp_t *xcp) {
+    xcp_daq_stop(xcp);
+    xcp->daq = (xcp_daq_t){0};
+    xcp->connected = false;
+    xcp->unlocked = 0;
+    xcp->seed = 0;
+    xcp->upload_left = 0;
+}
+
+static void put_word(uint8_t *at, uint32_t value) {
+    for (unsigned i = 0; i < 4; i++) {
+        at[i] = (uint8_t)(value >> (8 * i));
+    }
+}
+
+static uint32_t word_of(const uint8_t *at) {
+    return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
+}
+
+static void respond(message_t *response, const uint8_t *bytes, uint8_t count) {
+    for (unsigned i = 0; i < count; i++) {
+        response->data[1 + i] = bytes[i];
+    }
+    response->length = (uint8_t)(1 + count);
+}
+
+static xcp_error_t connect(xcp_t *xcp, message_t *response) {
+    end_session(xcp);
+    xcp->connected = true;
+    const uint8_t bytes[] = {RESOURCES, COMM_MODE, MESSAGE_BYTES, MESSAGE_BYTES, 0, PROTOCOL_VERSION, PROTOCOL_VERSION};
+    respond(response, bytes, sizeof bytes);
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t get_status(const xcp_t *xcp, message_t *response) {
+    const uint8_t bytes[] = {xcp->daq.running ? STATUS_DAQ : 0, (uint8_t)(RESOURCES & ~xcp->unlocked), 0, 0, 0};
+    respond(response, bytes, sizeof bytes);
+    return XCP_ERROR_NONE;
+}
+
+/* Of any type of identification there is one text. */
+static xcp_error_t get_id(xcp_t *xcp, message_t *response) {
+    const uint8_t bytes[] = {0, 0, 0, xcp_text_length(xcp, 0), 0, 0, 0};
+    respond(response, bytes, sizeof bytes);
+    xcp->address = XCP_AREA_TEXT;
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t get_seed(xcp_t *xcp, hal_t *hal, const uint8_t *command, uint32_t time_us, message_t *response) {
+    if (command[1] != 0 || (command[2] & RESOURCES) == 0 || (command[2] & (command[2] - 1u)) != 0) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    uint8_t bytes[1 + KEY_BYTES] = {0}; /* 0: it is unlocked */
+    if ((xcp->unlocked & command[2]) == 0) {
+        const uint32_t random = hal_random_u32(hal);
+        xcp->seed = random != 0 ? random : 1;
+        xcp->seed_us = time_us;
+        xcp->seed_resource = command[2];
+        bytes[0] = KEY_BYTES;
+        put_word(bytes + 1, xcp->seed);
+    }
+    respond(response, bytes, sizeof bytes);
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t unlock(xcp_t *xcp, const uint8_t *command, uint32_t time_us, message_t *response) {
+    const uint32_t seed = xcp->seed;
+    xcp->seed = 0;
+    if (seed == 0) {
+        return XCP_ERROR_SEQUENCE;
+    }
+    if (command[1] != KEY_BYTES || word_of(command + 2) != ~seed || time_us - xcp->seed_us > ARMING_RESPONSE_MAX_US) {
+        end_session(xcp); /* as the standard asks */
+        return XCP_ERROR_ACCESS_LOCKED;
+    }
+    xcp->unlocked |= xcp->seed_resource;
+    const uint8_t locked = (uint8_t)(RESOURCES & ~xcp->unlocked);
+    respond(response, &locked, 1);
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t set_request(const xcp_t *xcp, const xcp_context_t *context, const uint8_t *command) {
+    if (command[1] != STORE_CAL) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    if ((xcp->unlocked & XCP_RESOURCE_CALIBRATION) == 0) {
+        return XCP_ERROR_ACCESS_LOCKED;
+    }
+    if (context->conditions->running || !parameters_intact(context->parameters)) {
+        return XCP_ERROR_ACCESS_DENIED;
+    }
+    parameter_store_save(context->store);
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t download(xcp_t *xcp, const xcp_context_t *context, const uint8_t *command) {
+    const unsigned bytes = command[1];
+    if (bytes == 0 || bytes > DOWNLOAD_BYTES) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    const xcp_error_t error = xcp_memory_write(xcp, context, xcp->address, bytes, command + 2);
+    xcp->address += error == XCP_ERROR_NONE ? bytes : 0;
+    return error;
+}
+
+/* The first frame of an UPLOAD; the others follow by xcp_next_frame(). */
+static xcp_error_t upload(xcp_t *xcp, const parameters_t *parameters, unsigned bytes, message_t *response) {
+    uint8_t data[DATA_BYTES];
+    const uint8_t now = (uint8_t)(bytes < DATA_BYTES ? bytes : DATA_BYTES);
+    uint8_t last;
+    if (bytes == 0 || !xcp_memory_read(xcp, parameters, xcp->address + bytes - 1u, 1, &last) ||
+        !xcp_memory_read(xcp, parameters, xcp->address, now, data)) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    respond(response, data, now);
+    xcp->address += now;
+    xcp->upload_left = (uint8_t)(bytes - now);
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, const uint8_t *command,
+                                message_t *response) {
+    if (command[1] > DATA_BYTES || command[3] != 0) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    xcp->address = word_of(command + 4);
+    return upload(xcp, parameters, command[1], response);
+}
+
+static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, const xcp_context_t *context,
+                           uint32_t time_us, message_t *response) {
+    switch (command[0]) {
+    case DISCONNECT:
+        end_session(xcp);
+        return XCP_ERROR_NONE;
+    case GET_STATUS:
+        return get_status(xcp, response);
+    case SYNCH:
+        return XCP_ERROR_SYNCHRONISED;
+    case GET_COMM_MODE_INFO:
+        response->data[7] = DRIVER_VERSION;
+        response->length = MESSAGE_BYTES;
+        return XCP_ERROR_NONE;
+    case GET_ID:
+        return get_id(xcp, response);
+    case SET_REQUEST:
+        return set_request(xcp, context, command);
+    case GET_SEED:
+        return get_seed(xcp, hal, command, time_us, response);
+    case UNLOCK:
+        return unlock(xcp, command, time_us, response);
+    case SET_MTA:
+        xcp->address = word_of(command + 4);
+        return command[3] == 0 ? XCP_ERROR_NONE : XCP_ERROR_OUT_OF_RANGE; /* the address's extension */
+    case UPLOAD:
+        return upload(xcp, context->parameters, command[1], response);
+    case SHORT_UPLOAD:
+        return short_upload(xcp, context->parameters, command, response);
+    case DOWNLOAD:
+        return download(xcp, context, command);
+    default:
+        return xcp_daq_command(xcp, command, response->data, &response->length);
+    }
+}
+
+bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp_context_t *context, uint32_t time_us,
+                 hal_can_frame_t *response_frame) {
+    if (frame->length == 0 || frame->length > MESSAGE_BYTES) {
+        return false;
+    }
+    uint8_t command[MESSAGE_BYTES] = {0};
+    for (unsigned i = 0; i < frame->length; i++) {
+        command[i] = frame->data[i];
+    }
+    if (command[0] != CONNECT && !xcp->connected) { /* silent, as the standard asks */
+        return false;
+    }
+    xcp->received_us = time_us;
+    xcp->upload_left = 0; /* of an UPLOAD that the master has given up */
+    message_t response = {.data = {RESPONSE}, .length = 1};
+    const xcp_error_t error =
+        command[0] == CONNECT ? connect(xcp, &response) : execute(xcp, hal, command, context, time_us, &response);
+    if (error != XCP_ERROR_NONE) {
+        response = (message_t){.data = {ERROR, (uint8_t)error}, .length = 2};
+    }
+    *response_frame = (hal_can_frame_t){.identifier = DRIVE_XCP_RESPONSE_FRAME_ID, .length = response.length};
+    for (unsigned i = 0; i < response.length; i++) {
+        response_frame->data[i] = response.data[i];
+    }
+    return true;
+}
+
+void xcp_supervise(xcp_t *xcp, bool bus_off, uint32_t time_us) {
+    if (xcp->connected && (bus_off || time_us - xcp->received_us > XCP_SILENT_US)) {
+        end_session(xcp);
+    }
+}
+
+bool xcp_next_frame(xcp_t *xcp, const parameters_t *parameters, bool transmitting, hal_can_frame_t *frame) {
+    *frame = (hal_can_frame_t){.identifier = DRIVE_XCP_RESPONSE_FRAME_ID};
+    if (xcp->upload_left > 0) {
+        const uint8_t now = xcp->upload_left < DATA_BYTES ? xcp->upload_left : DATA_BYTES;
+        frame->data[0] = RESPONSE;
+        frame->length = (uint8_t)(1 + now);
+        xcp->upload_left = (uint8_t)(xcp->upload_left - now);
+        const bool read = xcp_memory_read(xcp, parameters, xcp->address, now, frame->data + 1);
+        xcp->address += now;
+        return read;
+    }
+    return xcp->daq.running && !transmitting && xcp_daq_next_frame(xcp, frame);
+}

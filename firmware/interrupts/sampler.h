@@ -1,0 +1,101 @@
+/* A recorder of the drive's memory at the rate of an event: a triggered buffer, or a stream that the background sends.
+ *
+ * At every `divider`-th event it copies up to eight words of the drive, each with the variables in it, into a ring. As
+ * a buffer it compares one variable with a level at every event, whatever the divider; from the event at which the
+ * condition holds it goes on until `before` records precede it and the rest of the ring follows. As a stream it records
+ * until it is stopped; a record for which the background has left no room is lost and counted.
+ *
+ * A word that another context writes is read whole; two words of one variable may be of two steps.
+ */
+#ifndef INTERRUPTS_SAMPLER_H
+#define INTERRUPTS_SAMPLER_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define SAMPLER_CHANNELS_MAX 8u
+
+/* Size of the ring, words; 0 for a processor that has no memory for it: then nothing can be armed. */
+#ifndef SAMPLER_WORDS
+#define SAMPLER_WORDS 4096u
+#endif
+
+typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_DEFERRED, SAMPLER_EVENT_BACKGROUND } sampler_event_t;
+
+typedef enum {
+    SAMPLER_AT_ONCE,  /* at the first event from which on enough records precede it */
+    SAMPLER_AT_LEAST, /* value >= level */
+    SAMPLER_AT_MOST,  /* value <= level */
+    SAMPLER_RISING,   /* value >= level, and below it at the event before */
+    SAMPLER_FALLING,  /* value <= level, and above it at the event before */
+    SAMPLER_EQUAL,
+    SAMPLER_CHANGED, /* another value than at the event before */
+    SAMPLER_CONDITIONS
+} sampler_condition_t;
+
+typedef enum {
+    SAMPLER_OFF,
+    SAMPLER_STREAMS,
+    SAMPLER_WAITS,    /* for the trigger */
+    SAMPLER_FOLLOWS,  /* records what follows the trigger */
+    SAMPLER_COMPLETE, /* the ring is to be read */
+} sampler_state_t;
+
+/* A variable within a word. Words are counted from the drive's begin. */
+typedef struct {
+    uint16_t word;
+    uint8_t left;  /* shift by which its highest bit becomes bit 31 */
+    uint8_t right; /* then by which its lowest one becomes bit 0, 0..31 */
+    bool is_signed;
+} sampler_variable_t;
+
+typedef struct {
+    uint16_t word[SAMPLER_CHANNELS_MAX]; /* of the drive */
+    uint8_t channels;                    /* 1..SAMPLER_CHANNELS_MAX */
+    sampler_event_t event;
+    uint16_t divider; /* events for each record, at least 1 */
+    /* Of the triggered buffer: */
+    uint16_t before; /* records before the trigger */
+    sampler_condition_t condition;
+    sampler_variable_t variable;
+    int32_t level;
+} sampler_setup_t;
+
+typedef struct {
+    uint32_t event; /* at which it records, sampler_event_t; 0: none. Written last when it is armed */
+    sampler_state_t state;
+    sampler_setup_t setup;
+    uint32_t record_words; /* the channels; before them in a stream the time, us */
+    uint32_t capacity;     /* of the ring, records */
+    uint32_t place;        /* of the next record in the ring, words; of a complete buffer that of the oldest one */
+    uint32_t missing;      /* records before the trigger that are still to be written */
+    uint32_t following;    /* records from the trigger on that are still to be written */
+    uint32_t countdown;    /* events to the next record */
+    uint32_t trigger_events; /* events from the trigger to record number `before`, counted from the oldest as 0 */
+    uint32_t written, taken; /* records of a stream, modulo 2^32; the second one is written by the background */
+    uint32_t taken_place;
+    uint32_t lost;           /* records of a stream */
+    int32_t last;            /* value of the variable at the event before */
+    bool has_last;
+    uint32_t ring[SAMPLER_WORDS > 0u ? SAMPLER_WORDS : 1u];
+} sampler_t;
+
+/* Stops recording; the ring stays as it is. [background] */
+void sampler_stop(sampler_t *sampler);
+
+/* Records from the next event on. streams: as a stream; else as a triggered buffer. False, with nothing changed, when a
+ * member of the set-up is out of its range or the ring has fewer than two records more than `before`. words: of the
+ * drive. [background] */
+bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool streams, uint32_t words);
+
+/* Triggers now, whatever the condition; no effect unless it waits. [background] */
+void sampler_trigger(sampler_t *sampler);
+
+/* The oldest record of a stream that is not taken: its words, the first one the time; false when there is none.
+ * [background] */
+bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_MAX]);
+
+/* An event for which sampler->event is set. memory: the drive, of `words` words. [context of the event] */
+void sampler_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us);
+
+#endif
