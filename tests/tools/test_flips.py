@@ -10,7 +10,7 @@ import pytest
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import flips
-from salient.experiments.campaign.layout import Layout
+from salient.drive_layout import Layout
 from salient.experiments.campaign.runner import digest, program
 from salient.experiments.campaign.runner import flips as run_flips
 

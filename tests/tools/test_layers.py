@@ -26,7 +26,7 @@ C_LAYERS = (
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
-JOINS_FIRMWARE_AND_EMULATOR = {"emulator/campaign/drive_layout.c", "emulator/host/host_drive.h",
+JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/drive_layout.c", "emulator/host/host_drive.h",
                                "emulator/host/memory_flip.h", "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 import numbers
 import sys
-from collections.abc import Callable
-from typing import Any, Self
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 import can
 from cantools.database.can import Database
@@ -25,6 +25,9 @@ from salient.bus.clock import RIG_CLOCK_ID, VirtualTimeReader, clock_of, open_bu
 from salient.bus.identity import IDENTITY_WAIT_NS, Carrier, OtherDatabase, hash_of
 from salient.bus.signals import SignalTable, drive_database, rig_database
 from salient.errors import RunFailed, UsageError, shown
+
+if TYPE_CHECKING:
+    from salient.bench.sampler import Scope
 
 RIG_RUN_UNTIL_ID = rig_database().get_message_by_name("RIG_RUN_UNTIL").frame_id
 SILENCE_MAX_S = 5.0
@@ -215,6 +218,14 @@ class Session(KnownAttributes):
     def clear_fault(self, kind: str, **places: str) -> None:
         """Ends a fault now. See Rig.clear_fault."""
         self.rig.clear_fault(kind, **places)
+
+    def scope(self, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25, divider: int = 1,
+              event: str = "control") -> Scope:
+        """Arms the drive's triggered buffer for 1 to 8 signals at the control rate: scope = bench.scope(["current_a_A",
+        "state"], trigger="state == fault"); its read() gives the arrays. See salient.bench.sampler.arm."""
+        from salient.bench import sampler  # needs it in turn
+
+        return sampler.arm(self, signals, trigger, before=before, divider=divider, event=event)
 
     def run_for(self, duration_s: float) -> None:
         """Lets virtual time pass; commands go out as they fall due.

@@ -24,7 +24,7 @@ from salient.errors import UsageError, exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
-from salient.experiments.campaign.layout import Layout
+from salient.drive_layout import Layout
 from salient.experiments.campaign.runner import Result, commit, digest, flips, program
 from salient.experiments.tasks import Task, check_build, run
 

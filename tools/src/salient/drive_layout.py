@@ -1,7 +1,9 @@
-"""Members of drive_t by their place in memory, from the debug information of salient_campaign."""
+"""Members of drive_t by their place in memory and by name, from the debug information of a program."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,26 @@ from salient.errors import UsageError
 
 _ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
 _VARIABLE = b"drive_layout"
+_BYTES_MAX = 4
+_SIGNED = {5, 6}
+"""DW_ATE_signed and DW_ATE_signed_char."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A number in the drive's memory. path: as of Layout.bits, with the indices of arrays; address: of its first byte,
+    from the begin of the drive; names: of an enumeration, by value."""
+
+    path: str
+    address: int
+    bytes: int
+    is_signed: bool
+    names: dict[int, str]
 
 
 class Layout:
-    """program: a file with the variable drive_layout, a pointer to the type (emulator/campaign/drive_layout.c).
-    size: of the type in bytes. UsageError: the file has no such variable."""
+    """program: a file with the variable drive_layout, a pointer to the type (emulator/host/drive_layout.c).
+    size: of the type in bytes; hash: of the layout, 0 in a file without. UsageError: the file has no such variable."""
 
     def __init__(self, program: Path) -> None:
         with program.open("rb") as file:
@@ -24,7 +41,12 @@ class Layout:
             if found is None:
                 raise UsageError(f"{program}: no debug information of the drive")
             self._type = _described(_target(_target(found)))
+            self.hash = _word_at(elf, "drive_layout_hash")
         self.size: int = self._type["bytes"]
+
+    def variables(self) -> Iterator[Variable]:
+        """Every number of at most 4 bytes, in the order of the memory. Neither pointers nor bit-fields."""
+        return _variables(self._type, 0, "")
 
     def member(self, bit: int) -> str:
         """Name of the member that has a bit, counted from the lowest of the first byte, with the indices of arrays;
@@ -41,6 +63,15 @@ class Layout:
             begin, length, _, of = found[0]
             first += begin
         return range(first, first + length)
+
+
+def _word_at(elf: ELFFile, symbol: str) -> int:
+    table = elf.get_section_by_name(".symtab")
+    for found in table.get_symbol_by_name(symbol) or () if table is not None else ():
+        section = elf.get_section(found["st_shndx"])
+        begin = found["st_value"] - section["sh_addr"]
+        return int.from_bytes(section.data()[begin:begin + 4], "little")
+    return 0
 
 
 def _find(dwarf: Any) -> Any:
@@ -73,7 +104,11 @@ def _described(entry: Any) -> dict[str, Any]:
             of = {"bytes": length * of["bytes"], "elements": (length, of)}
         return of
     if entry.tag not in ("DW_TAG_structure_type", "DW_TAG_union_type"):
-        return {"bytes": _number(entry, "DW_AT_byte_size")}
+        names = {_number(each, "DW_AT_const_value"): each.attributes["DW_AT_name"].value.decode()
+                 for each in entry.iter_children() if each.tag == "DW_TAG_enumerator"}
+        is_number = entry.tag in ("DW_TAG_base_type", "DW_TAG_enumeration_type")
+        return {"bytes": _number(entry, "DW_AT_byte_size"), "is_number": is_number, "names": names,
+                "is_signed": _number(entry, "DW_AT_encoding") in _SIGNED or any(value < 0 for value in names)}
     members = []
     for each in entry.iter_children():
         if each.tag != "DW_TAG_member":
@@ -95,3 +130,16 @@ def _member(of: dict[str, Any], bit: int, path: str) -> str:
         if first <= bit < first + bits:
             return _member(inner, bit - first, f"{path}.{name}" if path and name else path or name)
     return f"padding of {path or 'drive_t'}" if "members" in of else path
+
+
+def _variables(of: dict[str, Any], address: int, path: str) -> Iterator[Variable]:
+    if "elements" in of:
+        count, element = of["elements"]
+        for index in range(count):
+            yield from _variables(element, address + index * element["bytes"], f"{path}[{index}]")
+    elif "members" in of:
+        for first, bits, name, inner in of["members"]:
+            if bits == 8 * inner["bytes"]:
+                yield from _variables(inner, address + first // 8, f"{path}.{name}" if path and name else path or name)
+    elif of.get("is_number") and of["bytes"] <= _BYTES_MAX:
+        yield Variable(path, address, of["bytes"], of["is_signed"], of["names"])

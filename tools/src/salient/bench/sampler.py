@@ -1,0 +1,258 @@
+"""The drive's triggered buffer (firmware/interrupts/sampler.h): variables at the rate of its interrupts, by XCP.
+
+    scope = bench.scope(["torque_reference_Nm", "current_a_A"], trigger="torque_reference_Nm > 5")
+    bench.load_torque_Nm = 8
+    recording = scope.read()
+    recording.time_s, recording["current_a_A"]
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from salient.bench.programs import executable
+from salient.bench.variables import Quantity, Variables
+from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
+from salient.config import either
+from salient.errors import RunFailed, UsageError, close_names, shown
+
+if TYPE_CHECKING:
+    from pyxcp.master import Master
+
+    from salient.bench.session import Session
+
+CHANNELS_MAX = 8
+EVENTS = {"control": 1, "deferred": 2}
+DIVIDER_MAX = 65_535
+TIMEOUT_S = 1.0
+_COMMANDS = {"stop": 0, "arm": 1, "trigger": 2}
+_WORDS = ("command", "event", "divider", "before", "condition", "level", "variable", "left", "right", "signed",
+          "channels", "channel")
+"""Of the area of XCP, as xcp_scope_word_t; the last is the first of CHANNELS_MAX."""
+_AT_ONCE, _AT_LEAST, _AT_MOST, _RISING, _FALLING, _EQUAL, _CHANGED = range(7)
+"""sampler_condition_t."""
+_WORD_BYTES, _LEVEL_MAX, _WORD_BITS = 4, 2**31 - 1, 32
+_POLL_S = 2e-3
+_EXPRESSION = re.compile(r"\s*(?P<name>[\w.\[\]]+)\s*(?P<operator>>=|<=|==|>|<|rises to|falls to|changes)"
+                         r"\s*(?P<value>[\w.+-]*)\s*")
+
+
+class ScopeError(RunFailed):
+    """The trigger has not come in time, or the drive has another layout of its memory."""
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """A condition of the buffer. quantity: None for the first period."""
+
+    quantity: Quantity | None = None
+    condition: int = _AT_ONCE
+    level: int = 0
+
+
+def parse_trigger(text: str, variables: Variables) -> Trigger:
+    """The trigger of an expression: NAME > VALUE, with >, >=, <, <=, ==, `rises to` or `falls to` (from beyond the
+    value at the event before), or NAME changes. VALUE is in the signal's unit, or the name of an enumeration's value.
+    UsageError: a mistake, which it names, or a value that the variable cannot have."""
+    found = _EXPRESSION.fullmatch(text)
+    if found is None or bool(found["value"]) == (found["operator"] == "changes"):
+        raise UsageError(f"trigger '{text}': must be 'SIGNAL > VALUE', with >, >=, <, <=, ==, 'rises to' or 'falls to',"
+                         " or 'SIGNAL changes'")
+    quantity = variables.quantity(found["name"])
+    if found["operator"] == "changes":
+        return Trigger(quantity, _CHANGED)
+    raw = _raw(found["value"], quantity, text)
+    condition, rounded = {
+        ">": (_AT_LEAST, math.floor(raw) + 1), ">=": (_AT_LEAST, math.ceil(raw)), "rises to": (_RISING, math.ceil(raw)),
+        "<": (_AT_MOST, math.ceil(raw) - 1), "<=": (_AT_MOST, math.floor(raw)), "falls to": (_FALLING, math.floor(raw)),
+        "==": (_EQUAL, round(raw)),
+    }[found["operator"]]
+    bits = 8 * quantity.variable.bytes
+    least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if quantity.variable.is_signed else (0, (1 << bits) - 1)
+    if not least <= rounded <= min(most, _LEVEL_MAX):
+        raise UsageError(f"trigger '{text}': {quantity.name} is from {least * quantity.factor:g} to "
+                         f"{min(most, _LEVEL_MAX) * quantity.factor:g} {quantity.unit}".rstrip())
+    return Trigger(quantity, condition, rounded)
+
+
+def _raw(text: str, quantity: Quantity, expression: str) -> float:
+    names = {name: value for value, name in quantity.variable.names.items()}
+    short = {re.sub(f"^{re.escape(_common_prefix(names))}", "", name).lower(): value for name, value in names.items()}
+    if text in names or text in short:
+        return names.get(text, short.get(text, 0))
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        reason = f"must be a number or {either(list(short))}" if names else "must be a number"
+        raise UsageError(f"trigger '{expression}': {text} {reason}")
+    return value / quantity.factor
+
+
+def _common_prefix(names: Mapping[str, int]) -> str:
+    """Words that the names of an enumeration have in common: "DRIVE_STATE_"."""
+    words = [name.split("_") for name in names]
+    count = 0
+    while words and all(len(each) > count + 1 and each[count] == words[0][count] for each in words):
+        count += 1
+    return "".join(f"{word}_" for word in words[0][:count]) if words else ""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the buffer had. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of the
+    values of enumerations."""
+
+    time_s: np.ndarray
+    values: Mapping[str, np.ndarray]
+    units: Mapping[str, str]
+    names: Mapping[str, Mapping[int, str]]
+
+    def __getitem__(self, signal: str) -> np.ndarray:
+        if signal not in self.values:
+            raise KeyError(f"'{signal}' was not recorded; {close_names(signal, list(self.values))}")
+        return self.values[signal]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+
+class Scope:
+    """An armed buffer of a session's drive."""
+
+    def __init__(self, session: Session, quantities: Sequence[Quantity], before: int, period_s: float,
+                 divider: int) -> None:
+        self._session = session
+        self._quantities = list(quantities)
+        self._before, self._period_s, self._divider = before, period_s, divider
+
+    def trigger(self) -> None:
+        """Triggers now, whatever the condition."""
+        with connected(self._session) as master:
+            _write(master, "command", _COMMANDS["trigger"])
+
+    def read(self, timeout: float = TIMEOUT_S) -> Recording:
+        """Lets time pass until the buffer is complete, and reads it. ScopeError: it is not within `timeout` seconds of
+        virtual time; it stays armed."""
+        variables = variables_of(self._session)
+        deadline_ns = self._session.time_ns + round(1e9 * timeout)
+        with connected(self._session) as master:
+            while _member(master, variables, "sampler.state") != _state(variables, "SAMPLER_COMPLETE"):
+                if self._session.time_ns >= deadline_ns:
+                    raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
+                self._session.run_for(_POLL_S)
+            words, capacity, place, late = (_member(master, variables, f"sampler.{name}") for name in
+                                            ("record_words", "capacity", "place", "trigger_events"))
+            master.setMta(variables.layout.bits("sampler.ring").start // 8)
+            ring = np.frombuffer(bytes(master.fetch(_WORD_BYTES * words * capacity)), "<u4")
+        records = np.roll(ring, -place).reshape(capacity, words)
+        return self._recording(records, late)
+
+    def _recording(self, records: np.ndarray, late: int) -> Recording:
+        events = (np.arange(len(records)) - self._before) * self._divider + late
+        values = {quantity.name: _values(records[:, column], quantity)
+                  for column, quantity in enumerate(self._quantities)}
+        return Recording(events * self._period_s, values, {each.name: each.unit for each in self._quantities},
+                         {each.name: each.variable.names for each in self._quantities if each.variable.names})
+
+
+def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
+        divider: int = 1, event: str = "control") -> Scope:
+    """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th event, from the part
+    `before` of the buffer in front of the trigger on (parse_trigger; None: at once). UsageError: one of these is wrong;
+    ScopeError: the drive's memory has another layout than the program here."""
+    variables = variables_of(session)
+    if isinstance(signals, str) or not 1 <= len(signals) <= CHANNELS_MAX:
+        raise UsageError(f"signals: must be 1 to {CHANNELS_MAX} names")
+    quantities = [variables.quantity(name) for name in signals]
+    condition = Trigger() if trigger is None else parse_trigger(trigger, variables)
+    _check(divider, before, event)
+    with connected(session) as master:
+        _check_layout(master, variables)
+        size = variables.layout.bits("sampler.ring")
+        capacity = len(size) // (8 * _WORD_BYTES) // len(quantities)
+        records_before = min(int(before * capacity), capacity - 2)
+        of = condition.quantity or quantities[0]
+        first = of.variable.address % _WORD_BYTES
+        setup = {"event": EVENTS[event], "divider": divider, "before": records_before,
+                 "condition": condition.condition, "level": condition.level, "variable": of.variable.address,
+                 "left": _WORD_BITS - 8 * (first + of.variable.bytes), "right": _WORD_BITS - 8 * of.variable.bytes,
+                 "signed": of.variable.is_signed, "channels": len(quantities)}
+        for name, value in setup.items():
+            _write(master, name, int(value))
+        for number, quantity in enumerate(quantities):
+            _write(master, "channel", quantity.variable.address // _WORD_BYTES * _WORD_BYTES, number)
+        _write(master, "command", _COMMANDS["arm"])
+    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider)
+
+
+def _check(divider: Any, before: Any, event: str) -> None:
+    if event not in EVENTS:
+        raise UsageError(f"event '{event}': must be {either(list(EVENTS))}")
+    if not isinstance(divider, int) or not 1 <= divider <= DIVIDER_MAX:
+        raise UsageError(f"divider {shown(divider)}: must be a whole number from 1 to {DIVIDER_MAX}")
+    if not isinstance(before, int | float) or not 0.0 <= before < 1.0:
+        raise UsageError(f"before {shown(before)}: must be from 0 to below 1, the part of the buffer before the trigger")
+
+
+@lru_cache
+def _variables(machine: str | None) -> Variables:
+    return Variables(executable(), machine)
+
+
+def variables_of(session: Session) -> Variables:
+    """The variables of a session's drive, by the program of this build."""
+    return _variables(session.machine)
+
+
+def _check_layout(master: Master, variables: Variables) -> None:
+    master.setMta(AREA_TEXT)
+    text = bytes(master.fetch(len("salient") + 24)).decode("ascii", "replace")
+    layout = variables.layout
+    if text[7:15] != f"{layout.hash:08x}" or text[23:31] != f"{layout.size // _WORD_BYTES:08x}":
+        raise ScopeError(f"the drive ({text}) is of other sources than this build, or of another processor: its "
+                         "variables are elsewhere in its memory")
+
+
+def _write(master: Master, word: str, value: int, number: int = 0) -> None:
+    master.setMta(AREA_SCOPE + _WORD_BYTES * (_WORDS.index(word) + number))
+    master.download(struct.pack("<I", operator.index(value) & 0xFFFFFFFF))
+
+
+def _member(master: Master, variables: Variables, path: str) -> int:
+    variable = variables.quantity(path).variable
+    return int.from_bytes(bytes(master.shortUpload(variable.bytes, variable.address)), "little",
+                          signed=variable.is_signed)
+
+
+def _state(variables: Variables, name: str) -> int:
+    names = variables.quantity("sampler.state").variable.names
+    return next(value for value, each in names.items() if each == name)
+
+
+def _values(words: np.ndarray, quantity: Quantity) -> np.ndarray:
+    """The variable within words: floats in its unit, or integers where it has none."""
+    variable = quantity.variable
+    columns = np.ascontiguousarray(words).view(f"<{'i' if variable.is_signed else 'u'}{variable.bytes}")
+    raw = columns.reshape(len(words), -1)[:, variable.address % _WORD_BYTES // variable.bytes]
+    return raw.astype(np.int64) if quantity.factor == 1.0 else raw * quantity.factor
+
+
+def _control_rate_hz(session: Session) -> float:
+    """By the drive's heartbeat, which comes every 100 ms."""
+    deadline_ns = session.time_ns + 200_000_000
+    while not session.telemetry.count("DRIVE_HEARTBEAT"):
+        if session.time_ns >= deadline_ns:
+            raise ScopeError("no heartbeat of the drive within 0.2 s: its control rate is not known")
+        session.run_for(_POLL_S)
+    return float(session.telemetry["DRIVE_HEARTBEAT.control_rate_hz"].last)
