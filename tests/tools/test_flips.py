@@ -10,7 +10,7 @@ import pytest
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import flips
-from salient.drive_layout import Layout
+from salient.drive_layout import Layout, layout_file
 from salient.experiments.campaign.runner import digest, program
 from salient.experiments.campaign.runner import flips as run_flips
 
@@ -23,7 +23,7 @@ NOT_ARMED = {"rule": "no_command", "number": 1, "at_us": 1100}
 
 @pytest.fixture(scope="module")
 def layout() -> Layout:
-    return Layout(program())
+    return Layout(layout_file())
 
 
 @pytest.mark.parametrize(("change", "of"), [

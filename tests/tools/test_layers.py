@@ -20,14 +20,13 @@ Graph = Mapping[str, set[str]]
 
 C_LAYERS = (
     "hal/", "hal/qemu/", "firmware/fixed/", "firmware/control/", "firmware/storage/", "firmware/monitors/",
-    "firmware/interrupts/", "firmware/comms/", "firmware/drive/",
+    "firmware/interrupts/", "firmware/comms/", "firmware/drive/", "firmware/layout/",
     "emulator/plant/", "emulator/plant_library/", "emulator/plant_benchmark/", "emulator/fmi/", "emulator/rig/",
     "emulator/host/", "emulator/campaign/", "emulator/wasm/", "emulator/qemu/", "emulator/qemu/image/",
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
-JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/drive_layout.c", "emulator/host/host_drive.h",
-                               "emulator/host/memory_flip.h", "emulator/qemu/image/main.c"}
+JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h", "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
     "salient", "salient.guard", "salient.errors", "salient.paths", "salient.workers", "salient.progress",

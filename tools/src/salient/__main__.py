@@ -178,7 +178,12 @@ def _sweep(options: argparse.Namespace) -> int:
 def _machine(options: argparse.Namespace) -> int:
     from salient.machine.report import run
 
-    return run(options.machine, options.out, options.json, options.dbc, options.node, options.table)
+    code = run(options.machine, options.out, options.json, options.dbc, options.node, options.table)
+    if options.a2l is not None:
+        from salient.bench.a2l import write_a2l
+
+        write_a2l(options.a2l, options.machine, node=options.node)
+    return code
 
 
 def _wheel(options: argparse.Namespace) -> int:

@@ -202,6 +202,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                          help="first import a table of flux linkages of any layout (CSV, text, MAT) as the map of the "
                          "machine: writes its machine file with the map to the folder")
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
+    machine.add_argument("--a2l", type=Path, metavar="FILE.a2l",
+                         help="also write the A2L file of its drive, for measurement and calibration tools (XCP)")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")
     _add_node(machine)
@@ -258,9 +260,21 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     evidence.add_argument("--run", action="store_true",
                           help="first run the commands of the claims that are red: hours, resumable")
 
-    scope = command("scope", "the control periods before the last fault of a running drive, from its buffer: table and "
-                    "plot")
+    scope = command("scope", "variables of a running drive at its control rate around a trigger, or the control periods "
+                    "before its last fault: table and plot")
     _add_can(scope)
+    scope.add_argument("--signals", nargs="+", default=[], metavar="NAME",
+                       help="variables, at most 8, as speed_rpm, current_a_A or control.observer.speed_q22 (--list); "
+                       "without: the periods before the last fault")
+    scope.add_argument("--trigger", metavar="EXPRESSION",
+                       help='"NAME > VALUE" (>=, <, <=, ==, rises to, falls to), "NAME changes" (default: at once)')
+    scope.add_argument("--before", type=_finite, default=0.25, metavar="PART",
+                       help="part of the buffer before the trigger (default %(default)s)")
+    scope.add_argument("--divider", type=_count, default=1, metavar="N",
+                       help="every N-th control period (default %(default)s)")
+    scope.add_argument("--timeout", type=_positive, default=10.0, metavar="S",
+                       help="time to wait for the trigger (default %(default)s)")
+    scope.add_argument("--list", action="store_true", help="instead: list the short names, and the variables")
     scope.add_argument("--out", type=Path, default=OUT / "scope", metavar="DIR",
                        help="folder (default %(default)s)")
     _add_machine(scope)

@@ -1,4 +1,4 @@
-"""Members of drive_t by their place in memory and by name, from the debug information of a program."""
+"""Members of drive_t by their place in memory and by name, from the debug information of a build."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from typing import Any
 from elftools.elf.elffile import ELFFile
 
 from salient.errors import UsageError
+from salient.paths import BUILD
 
 _ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
 _VARIABLE = b"drive_layout"
 _BYTES_MAX = 4
 _SIGNED = {5, 6}
 """DW_ATE_signed and DW_ATE_signed_char."""
+
+
+def layout_file(build: str = "host") -> Path:
+    """Of a build, as a file for Layout."""
+    return BUILD / build / "firmware" / "drive_layout.o"
 
 
 @dataclass(frozen=True)
@@ -31,10 +37,12 @@ class Variable:
 
 
 class Layout:
-    """program: a file with the variable drive_layout, a pointer to the type (emulator/host/drive_layout.c).
+    """program: a file with the variable drive_layout, a pointer to the type (firmware/layout/drive_layout.c).
     size: of the type in bytes; hash: of the layout, 0 in a file without. UsageError: the file has no such variable."""
 
     def __init__(self, program: Path) -> None:
+        if not program.exists():
+            raise UsageError(f"{program} is missing: cmake --build {program.parent.parent} makes it")
         with program.open("rb") as file:
             elf = ELFFile(file)
             found = _find(elf.get_dwarf_info()) if elf.has_dwarf_info() else None

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from salient.bench.programs import executable
 from salient.bench.variables import Quantity, Variables
 from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
 from salient.config import either
@@ -206,13 +205,14 @@ def _check(divider: Any, before: Any, event: str) -> None:
 
 
 @lru_cache
-def _variables(machine: str | None) -> Variables:
-    return Variables(executable(), machine)
+def _variables(build: str, machine: str | None) -> Variables:
+    return Variables(build, machine)
 
 
 def variables_of(session: Session) -> Variables:
-    """The variables of a session's drive, by the program of this build."""
-    return _variables(session.machine)
+    """The variables of a session's drive, in the memory of its build; of a drive that runs by itself, of the host's."""
+    options = getattr(session, "options", None)
+    return _variables("host" if options is None else options.build, session.machine)
 
 
 def _check_layout(master: Master, variables: Variables) -> None:

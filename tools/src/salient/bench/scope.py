@@ -1,12 +1,13 @@
-"""The drive's triggered buffer, the control periods up to the one that latched a fault, as table and plot:
-`tools/salient scope`. The drive keeps them from the fault to the next run. It does not keep the signals of other nodes:
-those are of the time in which the buffer is read."""
+"""What the drive has recorded at its control rate, as table and plot: `tools/salient scope`. With signals they are
+recorded around a trigger (salient.bench.sampler). Without, it is the control periods up to the one that latched a fault,
+which the drive keeps from the fault to the next run. It does not keep the signals of other nodes: those are of the time
+in which the buffer is read."""
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,12 @@ import can
 import numpy as np
 from cantools.database.can import Database
 
+from salient.bench import sampler
 from salient.bench.drive import FaultTrace
 from salient.bench.failure import COLOURS
 from salient.bench.session import SILENCE_MAX_S, Session
+from salient.bench.variables import SIGNALS as SHORT_NAMES
+from salient.bench.variables import Variables
 from salient.bus.databases import load_databases, messages_of
 from salient.bus.frame_bits import BitRates
 from salient.bus.log import open_log
@@ -35,6 +39,10 @@ def run(options: argparse.Namespace) -> int:
     """Reads the buffer of a running drive into a folder; returns the exit code. dbc: databases of other nodes; with
     them the signals of the bus meanwhile are a table, too, and its traffic is printed. UsageError: see
     load_databases."""
+    if options.list:
+        return _list(options.machine)
+    if options.signals:
+        return _record(options)
     others = load_databases(options.dbc, options.node)
     make_folder(options.out, [TABLE, PLOT, *([SIGNALS] if others else [])])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
@@ -50,6 +58,50 @@ def run(options: argparse.Namespace) -> int:
     if others:
         _tell_bus(options, session.log, others)
     return 0
+
+
+def _list(machine: str | None) -> int:
+    variables = Variables(machine=machine)
+    for name, path in SHORT_NAMES.items():
+        print(f"{name:22} {path}")
+    print("\n".join(quantity.name for quantity in variables.quantities()))
+    return 0
+
+
+def _record(options: argparse.Namespace) -> int:
+    """UsageError: see sampler.arm; ScopeError: the trigger has not come."""
+    make_folder(options.out, [TABLE, PLOT])
+    with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
+                 silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
+        scope = sampler.arm(session, options.signals, options.trigger, before=options.before, divider=options.divider)
+        recording = scope.read(options.timeout)
+    table = {"time_s": recording.time_s, **recording.values}
+    _write_columns(table, options.out / TABLE)
+    plot_recording(recording, options.out / PLOT, options.trigger or "at once")
+    print(f"{options.trigger or 'at once'}: {len(recording.time_s)} records from {1e3 * recording.time_s[0]:.3f} to "
+          f"{1e3 * recording.time_s[-1]:.3f} ms: {options.out / TABLE}, {options.out / PLOT}")
+    return 0
+
+
+def plot_recording(recording: sampler.Recording, path: Path, title: str) -> None:
+    """Each signal over the time from the trigger on."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 1.5 + 1.6 * len(recording.values)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = np.atleast_1d(figure.subplots(len(recording.values), 1, sharex=True))
+    time_ms = recording.time_s * _MS_PER_S
+    for axis, (name, values), colour in zip(axes, recording.values.items(), COLOURS * 2, strict=False):
+        axis.step(time_ms, values, where="post", color=colour, linewidth=1)
+        axis.axvline(0.0, color="grey", linewidth=0.8)
+        _label(axis, name if name.endswith(recording.units[name]) else f"{name}, {recording.units[name]}".rstrip(", "))
+        if name in recording.names:
+            axis.set_yticks(list(recording.names[name]), [text.rsplit("_", 1)[-1].lower() for text in
+                                                          recording.names[name].values()])
+    axes[-1].set_xlabel("time from the trigger, ms")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
 def _listen(session: Session, others: Sequence[Database]) -> None:
@@ -88,7 +140,10 @@ def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
 
 def write_table(trace: FaultTrace, path: Path) -> None:
     """Comma-separated values, the last row that of the fault."""
-    of = columns(trace)
+    _write_columns(columns(trace), path)
+
+
+def _write_columns(of: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(of)

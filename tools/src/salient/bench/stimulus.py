@@ -36,6 +36,9 @@ _REFERENCES = {"DRIVE_COMMAND": ("speed", "speed_reference_rpm"),
                "DRIVE_TORQUE_COMMAND": ("torque", "torque_reference_Nm")}
 _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
+_XCP_SET_MTA, _XCP_DOWNLOAD = 0xF6, 0xF0
+_XCP_PARAMETERS = 0x10000000
+"""Commands of XCP, and the address of the first parameter (firmware/comms/xcp.h)."""
 _SILENT_PERIODS = 3
 """Periods of the commands, after which they have ceased."""
 
@@ -140,6 +143,7 @@ class _Reader:
         self._challenge = 0
         self._staged: list[str] = []
         self._staged_ns = 0
+        self._xcp_address = 0
         self._sets: dict[bytes, Stimulus] = {}
         self._profile: Stimulus | None = None
         self._unanswered: dict[tuple[str, int], deque[tuple[int, Stimulus]]] = defaultdict(deque)
@@ -148,7 +152,7 @@ class _Reader:
                       "PARAMETER_REQUEST": self._parameter_request, "DRIVE_ARMING": self._arming_report,
                       "PARAMETER_RESPONSE": self._parameter_response, "RIG_SET": self._rig_set,
                       "RIG_LOAD_PROFILE": self._load_profile, "RIG_FAULT": self._rig_fault,
-                      "RIG_SET_REPLY": self._reply, "RIG_FAULT_REPLY": self._reply}
+                      "XCP_COMMAND": self._xcp, "RIG_SET_REPLY": self._reply, "RIG_FAULT_REPLY": self._reply}
 
     def take(self, time_ns: int, message: Message, frame: can.Message) -> None:
         """Takes a frame of one of `messages`."""
@@ -276,6 +280,19 @@ class _Reader:
         stimulus = self._sets.pop(bytes(frame.data[4:]), None) if str(values["operation"]) == "set_control" else None
         if stimulus is not None and str(values["status"]) != "done":
             stimulus.text += f" (refused: {values['status']})"
+
+    def _xcp(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:
+        """A write of a parameter; the rest of XCP reads and records."""
+        del message, values
+        data = bytes(frame.data)
+        if data[0] == _XCP_SET_MTA:
+            self._xcp_address = int.from_bytes(data[4:8], "little")
+        elif data[0] == _XCP_DOWNLOAD:
+            index, rest = divmod(self._xcp_address - _XCP_PARAMETERS, 4)
+            self._xcp_address += data[1]
+            if rest == 0 and 0 <= index < len(self._rows):
+                value = int.from_bytes(data[2:6], "little", signed=True)
+                self._add(time_ns, f"parameter by XCP: {self._value(index, value)}")
 
     # --- test bench ---
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from salient.dbc import PHASES
-from salient.drive_layout import Layout, Variable
+from salient.drive_layout import Layout, Variable, layout_file
 from salient.errors import UsageError, close_names
 from salient.machine.file import load_machine
 from salient.machine.path import machine_path
@@ -59,14 +58,19 @@ class Quantity:
 
 
 class Variables:
-    """The variables of a program's drive. machine: of the drive, whose exponents its units have; None: SI units.
-    UsageError: the program has no debug information; of quantity(): there is no variable of that name."""
+    """The variables of a build's drive. machine: of the drive, whose exponents its units have; None: SI units.
+    UsageError: the build has no layout; of quantity(): there is no variable of that name."""
 
-    def __init__(self, program: Path, machine: str | None = None) -> None:
-        self.layout = Layout(program)
+    def __init__(self, build: str = "host", machine: str | None = None) -> None:
+        self.layout = Layout(layout_file(build))
         path = None if machine is None else machine_path(machine)
         self._exponents = Exponents() if path is None else scaling_of(path, load_machine(path)).exponents
         self._variables = {variable.path: variable for variable in self.layout.variables()}
+
+    @property
+    def paths(self) -> Collection[str]:
+        """Of all."""
+        return self._variables.keys()
 
     def quantities(self) -> Iterator[Quantity]:
         """All, in the order of the memory."""

@@ -24,7 +24,7 @@ from salient.errors import UsageError, exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
-from salient.drive_layout import Layout
+from salient.drive_layout import Layout, layout_file
 from salient.experiments.campaign.runner import Result, commit, digest, flips, program
 from salient.experiments.tasks import Task, check_build, run
 
@@ -209,7 +209,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--jobs", type=count, metavar="N", help="simultaneous runs (default: number of cores)")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the counts as a page")
     options = parser.parse_args(arguments)
-    layout = Layout(program())
+    layout = Layout(layout_file())
     listed = tasks(options.stride, options.seed, layout)
     results = [result for _, result in run(listed, serve, options.out, options.shard, jobs=options.jobs)]
     note = summary(results, layout, options.stride, options.seed)
