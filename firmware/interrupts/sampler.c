@@ -42,13 +42,13 @@ static bool holds(const sampler_t *sampler, int32_t value) {
 
 static void follow(sampler_t *sampler) {
     sampler->trigger_events = sampler->countdown;
-    sampler->following = sampler->capacity - sampler->setup.before;
+    sampler->following = sampler->capacity - (sampler->setup.before - sampler->missing);
     sampler->state = SAMPLER_FOLLOWS;
 }
 
 static void await_trigger(sampler_t *sampler, const void *memory, uint32_t words) {
     const int32_t value = value_of(&sampler->setup.variable, memory, words);
-    if (sampler->missing == 0 && holds(sampler, value)) {
+    if (holds(sampler, value)) {
         follow(sampler);
     }
     sampler->last = value;
@@ -73,7 +73,7 @@ static void write_record(sampler_t *sampler, const void *memory, uint32_t words,
         sampler->ring[place++] = word_at(memory, words, sampler->setup.word[i]);
     }
     sampler->place = next_place(sampler, place);
-    sampler->missing -= sampler->missing > 0;
+    sampler->missing -= sampler->missing > 0 && sampler->state == SAMPLER_WAITS;
     sampler->written++;
 }
 

@@ -2,7 +2,8 @@
  *
  * At every `divider`-th event it copies up to eight words of the drive, each with the variables in it, into a ring. As
  * a buffer it compares one variable with a level at every event, whatever the divider; from the event at which the
- * condition holds it goes on until `before` records precede it and the rest of the ring follows. As a stream it records
+ * condition holds it goes on until the ring is full of `before` records that precede it, or those that there are, and
+ * those that follow. As a stream it records
  * until it is stopped; a record for which the background has left no room is lost and counted.
  *
  * A word that another context writes is read whole; two words of one variable may be of two steps.
@@ -23,7 +24,7 @@
 typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_DEFERRED, SAMPLER_EVENT_BACKGROUND } sampler_event_t;
 
 typedef enum {
-    SAMPLER_AT_ONCE,  /* at the first event from which on enough records precede it */
+    SAMPLER_AT_ONCE,  /* at the next event */
     SAMPLER_AT_LEAST, /* value >= level */
     SAMPLER_AT_MOST,  /* value <= level */
     SAMPLER_RISING,   /* value >= level, and below it at the event before */
@@ -68,10 +69,10 @@ typedef struct {
     uint32_t record_words; /* the channels; before them in a stream the time, us */
     uint32_t capacity;     /* of the ring, records */
     uint32_t place;        /* of the next record in the ring, words; of a complete buffer that of the oldest one */
-    uint32_t missing;      /* records before the trigger that are still to be written */
+    uint32_t missing;      /* records by which fewer than `before` precede the trigger */
     uint32_t following;    /* records from the trigger on that are still to be written */
     uint32_t countdown;    /* events to the next record */
-    uint32_t trigger_events; /* events from the trigger to record number `before`, counted from the oldest as 0 */
+    uint32_t trigger_events; /* events from the trigger to record number `before` - `missing`, from the oldest on */
     uint32_t written, taken; /* records of a stream, modulo 2^32; the second one is written by the background */
     uint32_t taken_place;
     uint32_t lost;           /* records of a stream */

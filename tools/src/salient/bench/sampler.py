@@ -150,15 +150,16 @@ class Scope:
                 if self._session.time_ns >= deadline_ns:
                     raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
                 self._session.run_for(_POLL_S)
-            words, capacity, place, late = (_member(master, variables, f"sampler.{name}") for name in
-                                            ("record_words", "capacity", "place", "trigger_events"))
+            words, capacity, place, missing, late = (
+                _member(master, variables, f"sampler.{name}")
+                for name in ("record_words", "capacity", "place", "missing", "trigger_events"))
             master.setMta(variables.layout.bits("sampler.ring").start // 8)
             ring = np.frombuffer(bytes(master.fetch(_WORD_BYTES * words * capacity)), "<u4")
         records = np.roll(ring, -place).reshape(capacity, words)
-        return self._recording(records, late)
+        return self._recording(records, self._before - missing, late)
 
-    def _recording(self, records: np.ndarray, late: int) -> Recording:
-        events = (np.arange(len(records)) - self._before) * self._divider + late
+    def _recording(self, records: np.ndarray, before: int, late: int) -> Recording:
+        events = (np.arange(len(records)) - before) * self._divider + late
         values = {quantity.name: _values(records[:, column], quantity)
                   for column, quantity in enumerate(self._quantities)}
         return Recording(events * self._period_s, values, {each.name: each.unit for each in self._quantities},
@@ -168,7 +169,7 @@ class Scope:
 def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
         divider: int = 1, event: str = "control") -> Scope:
     """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th event, from the part
-    `before` of the buffer in front of the trigger on (parse_trigger; None: at once). UsageError: one of these is wrong;
+    `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on. UsageError: one of these is wrong;
     ScopeError: the drive's memory has another layout than the program here."""
     variables = variables_of(session)
     if isinstance(signals, str) or not 1 <= len(signals) <= CHANNELS_MAX:

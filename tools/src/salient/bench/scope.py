@@ -95,7 +95,7 @@ def plot_recording(recording: sampler.Recording, path: Path, title: str) -> None
     for axis, (name, values), colour in zip(axes, recording.values.items(), COLOURS * 2, strict=False):
         axis.step(time_ms, values, where="post", color=colour, linewidth=1)
         axis.axvline(0.0, color="grey", linewidth=0.8)
-        _label(axis, name if name.endswith(recording.units[name]) else f"{name}, {recording.units[name]}".rstrip(", "))
+        _label(axis, name if name in SHORT_NAMES else f"{name}, {recording.units[name]}".rstrip(", "))
         if name in recording.names:
             axis.set_yticks(list(recording.names[name]), [text.rsplit("_", 1)[-1].lower() for text in
                                                           recording.names[name].values()])

@@ -36,10 +36,10 @@ SIGNALS = {
 """Short names of what is looked at most, with their units."""
 
 _FORMATS = (
-    (r"(torque|load)\w*_q24", "N m", 1.0),
-    (r"speed\w*_q22", "r/min", 30.0 / math.pi),
-    (r"current\w*_q9", "A", 1.0),
-    (r"voltage\w*_q6", "V", 1.0),
+    (r"\w*(torque|load)\w*_q24", "N m", 1.0),
+    (r"\w*speed\w*_q22", "r/min", 30.0 / math.pi),
+    (r"\w*current\w*_q9", "A", 1.0),
+    (r"\w*voltage\w*_q6", "V", 1.0),
     (r"\w*flux\w*_q29", "Wb", 1.0),
 )
 """Unit of the members whose name has a quantity and its fraction bits (firmware/fixed/formats.h), and the factor to it
