@@ -105,7 +105,8 @@ NOINLINE void sampler_record(sampler_t *sampler, const void *memory, uint32_t wo
 }
 
 COLD void sampler_stop(sampler_t *sampler) {
-    sampler->event = 0;
+    *(volatile uint32_t *)&sampler->event = 0;
+    __atomic_signal_fence(__ATOMIC_SEQ_CST); /* the interrupt leaves the rest alone from here on */
     if (sampler->state != SAMPLER_COMPLETE) {
         sampler->state = SAMPLER_OFF;
     }
@@ -140,7 +141,7 @@ COLD bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool str
     sampler->countdown = 1;
     sampler->has_last = false;
     sampler->state = streams ? SAMPLER_STREAMS : SAMPLER_WAITS;
-    /* The interrupt of the event may come from here on. */
+    __atomic_signal_fence(__ATOMIC_RELEASE); /* the interrupt of the event may come from here on */
     *(volatile uint32_t *)&sampler->event = setup->event;
     return true;
 }
@@ -153,12 +154,14 @@ COLD bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_
     if (sampler->state != SAMPLER_STREAMS || *(volatile uint32_t *)&sampler->written == sampler->taken) {
         return false;
     }
+    __atomic_signal_fence(__ATOMIC_ACQUIRE);
     uint32_t place = sampler->taken_place;
     for (uint32_t i = 0; i < sampler->record_words && i <= SAMPLER_CHANNELS_MAX; i++) {
         record[i] = place < SAMPLER_WORDS ? sampler->ring[place] : 0;
         place++;
     }
     sampler->taken_place = next_place(sampler, place);
+    __atomic_signal_fence(__ATOMIC_RELEASE); /* the interrupt may overwrite the record from here on */
     *(volatile uint32_t *)&sampler->taken = sampler->taken + 1u;
     return true;
 }
