@@ -12,15 +12,20 @@ static inline uint32_t word_at(const void *memory, uint32_t words, uint32_t word
     return word < words ? ((memory_word_t *)memory)[word] : 0;
 }
 
+/* Unsigned values are compared as signed ones from -2^31 on, in their order. */
+static inline int32_t in_order(const sampler_variable_t *variable, uint32_t value) {
+    return (int32_t)(variable->is_signed ? value : value ^ 0x80000000u);
+}
+
 static inline int32_t value_of(const sampler_variable_t *variable, const void *memory, uint32_t words) {
     const uint32_t left = word_at(memory, words, variable->word) << (variable->left & 31u);
     const uint32_t right = variable->right & 31u;
     /* Arithmetic shift of a negative number: as everywhere in the firmware (fixed/fixed.h). */
-    return variable->is_signed ? (int32_t)left >> right : (int32_t)(left >> right);
+    return in_order(variable, variable->is_signed ? (uint32_t)((int32_t)left >> right) : left >> right);
 }
 
 static bool holds(const sampler_t *sampler, int32_t value) {
-    const int32_t level = sampler->setup.level;
+    const int32_t level = in_order(&sampler->setup.variable, (uint32_t)sampler->setup.level);
     switch (sampler->setup.condition) {
     case SAMPLER_AT_LEAST:
         return value >= level;
@@ -60,15 +65,17 @@ static inline uint32_t next_place(const sampler_t *sampler, uint32_t end) {
 }
 
 static void write_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us) {
+    const bool streams = sampler->state == SAMPLER_STREAMS;
+    const uint32_t channels = sampler->setup.channels % (SAMPLER_CHANNELS_MAX + 1u);
+    const uint32_t needed = channels + (streams ? 1u : 0u);
     uint32_t place = sampler->place;
-    if (place + sampler->record_words > SAMPLER_WORDS) { /* changed in memory */
+    if (needed > SAMPLER_WORDS || place > SAMPLER_WORDS - needed) { /* changed in memory */
         sampler_stop(sampler);
         return;
     }
-    if (sampler->state == SAMPLER_STREAMS) {
+    if (streams) {
         sampler->ring[place++] = time_us;
     }
-    const uint32_t channels = sampler->setup.channels % (SAMPLER_CHANNELS_MAX + 1u);
     for (uint32_t i = 0; i < channels; i++) {
         sampler->ring[place++] = word_at(memory, words, sampler->setup.word[i]);
     }
@@ -98,7 +105,8 @@ NOINLINE void sampler_record(sampler_t *sampler, const void *memory, uint32_t wo
 }
 
 COLD void sampler_stop(sampler_t *sampler) {
-    sampler->event = 0;
+    *(volatile uint32_t *)&sampler->event = 0;
+    __atomic_signal_fence(__ATOMIC_SEQ_CST); /* the interrupt leaves the rest alone from here on */
     if (sampler->state != SAMPLER_COMPLETE) {
         sampler->state = SAMPLER_OFF;
     }
@@ -133,7 +141,7 @@ COLD bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool str
     sampler->countdown = 1;
     sampler->has_last = false;
     sampler->state = streams ? SAMPLER_STREAMS : SAMPLER_WAITS;
-    /* The interrupt of the event may come from here on. */
+    __atomic_signal_fence(__ATOMIC_RELEASE); /* the interrupt of the event may come from here on */
     *(volatile uint32_t *)&sampler->event = setup->event;
     return true;
 }
@@ -146,12 +154,14 @@ COLD bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_
     if (sampler->state != SAMPLER_STREAMS || *(volatile uint32_t *)&sampler->written == sampler->taken) {
         return false;
     }
+    __atomic_signal_fence(__ATOMIC_ACQUIRE);
     uint32_t place = sampler->taken_place;
     for (uint32_t i = 0; i < sampler->record_words && i <= SAMPLER_CHANNELS_MAX; i++) {
         record[i] = place < SAMPLER_WORDS ? sampler->ring[place] : 0;
         place++;
     }
     sampler->taken_place = next_place(sampler, place);
+    __atomic_signal_fence(__ATOMIC_RELEASE); /* the interrupt may overwrite the record from here on */
     *(volatile uint32_t *)&sampler->taken = sampler->taken + 1u;
     return true;
 }

@@ -59,7 +59,7 @@ typedef struct {
     uint16_t before; /* records before the trigger */
     sampler_condition_t condition;
     sampler_variable_t variable;
-    int32_t level;
+    int32_t level; /* signed or not as the variable is */
 } sampler_setup_t;
 
 typedef struct {
@@ -76,7 +76,7 @@ typedef struct {
     uint32_t written, taken; /* records of a stream, modulo 2^32; the second one is written by the background */
     uint32_t taken_place;
     uint32_t lost;           /* records of a stream */
-    int32_t last;            /* value of the variable at the event before */
+    int32_t last;            /* value of the variable at the event before; unsigned less 2^31 */
     bool has_last;
     uint32_t ring[SAMPLER_WORDS > 0u ? SAMPLER_WORDS : 1u];
 } sampler_t;
