@@ -5,6 +5,7 @@
 #include "comms/xcp_memory.h"
 #include "control/machine_tables.h"
 #include "drive_codec.h"
+#include "fixed/fixed.h"
 #include "hal_random.h"
 #include "layout_hash.h"
 
@@ -25,6 +26,7 @@ enum {
 };
 
 enum { RESPONSE = 0xFF, ERROR = 0xFE };
+enum { ID_TEXT = 0, ID_FILE_NAME = 1, ID_EPK = 5 };
 enum { MESSAGE_BYTES = 8, DATA_BYTES = MESSAGE_BYTES - 1, DOWNLOAD_BYTES = MESSAGE_BYTES - 2, KEY_BYTES = 4 };
 
 #define RESOURCES (XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ)
@@ -38,6 +40,19 @@ typedef struct {
     uint8_t data[MESSAGE_BYTES];
     uint8_t length;
 } message_t;
+
+/* Bytes of a command without data and keys of a count of its own; 0: one byte, or a command of xcp_daq.h. */
+static const uint8_t least_bytes[] = {
+    [DOWNLOAD - DOWNLOAD] = 2, [SHORT_UPLOAD - DOWNLOAD] = 8, [UPLOAD - DOWNLOAD] = 2,
+    [SET_MTA - DOWNLOAD] = 8,  [UNLOCK - DOWNLOAD] = 2,       [GET_SEED - DOWNLOAD] = 3,
+    [SET_REQUEST - DOWNLOAD] = 4, [GET_ID - DOWNLOAD] = 2,    [CONNECT - DOWNLOAD] = 2,
+};
+
+static bool is_whole(const uint8_t *command, unsigned bytes) {
+    const bool counted = command[0] == DOWNLOAD || command[0] == UNLOCK;
+    const unsigned least = command[0] < DOWNLOAD ? 0 : least_bytes[command[0] - DOWNLOAD];
+    return bytes >= least + (counted ? fixed_min_u32(command[1], DOWNLOAD_BYTES) : 0);
+}
 
 static char *append_hexadecimal(char *at, uint32_t value) {
     for (int shift = 28; shift >= 0; shift -= 4) {
@@ -98,15 +113,18 @@ static xcp_error_t connect(xcp_t *xcp, message_t *response) {
     return XCP_ERROR_NONE;
 }
 
-static xcp_error_t get_status(const xcp_t *xcp, message_t *response) {
-    const uint8_t bytes[] = {xcp->daq.running ? STATUS_DAQ : 0, (uint8_t)(RESOURCES & ~xcp->unlocked), 0, 0, 0};
+static xcp_error_t get_status(const xcp_t *xcp, const nvm_store_t *store, message_t *response) {
+    const unsigned status =
+        (xcp->daq.running ? STATUS_DAQ : 0) | (store->saving == NVM_STORE_SAVING ? STORE_CAL : 0);
+    const uint8_t bytes[] = {(uint8_t)status, (uint8_t)(RESOURCES & ~xcp->unlocked), 0, 0, 0};
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;
 }
 
-/* Of any type of identification there is one text. */
-static xcp_error_t get_id(xcp_t *xcp, message_t *response) {
-    const uint8_t bytes[] = {0, 0, 0, xcp_text_length(xcp, 0), 0, 0, 0};
+/* One text serves as description, as name of the A2L file and as EPK; other types of identification there are not. */
+static xcp_error_t get_id(xcp_t *xcp, const uint8_t *command, message_t *response) {
+    const bool has = command[1] == ID_TEXT || command[1] == ID_FILE_NAME || command[1] == ID_EPK;
+    const uint8_t bytes[] = {0, 0, 0, has ? xcp_text_length(xcp, 0) : 0, 0, 0, 0};
     respond(response, bytes, sizeof bytes);
     xcp->address = XCP_AREA_TEXT;
     return XCP_ERROR_NONE;
@@ -184,6 +202,15 @@ static xcp_error_t upload(xcp_t *xcp, const parameters_t *parameters, unsigned b
     return XCP_ERROR_NONE;
 }
 
+/* There is no address extension. */
+static xcp_error_t set_address(xcp_t *xcp, const uint8_t *command) {
+    if (command[3] != 0) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    xcp->address = word_of(command + 4);
+    return XCP_ERROR_NONE;
+}
+
 static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, const uint8_t *command,
                                 message_t *response) {
     if (command[1] > DATA_BYTES || command[3] != 0) {
@@ -193,14 +220,19 @@ static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, cons
     return upload(xcp, parameters, command[1], response);
 }
 
-static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, const xcp_context_t *context,
-                           uint32_t time_us, message_t *response) {
+static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsigned bytes,
+                           const xcp_context_t *context, uint32_t time_us, message_t *response) {
+    if (!is_whole(command, bytes)) {
+        return XCP_ERROR_SYNTAX;
+    }
     switch (command[0]) {
+    case CONNECT:
+        return connect(xcp, response);
     case DISCONNECT:
         end_session(xcp);
         return XCP_ERROR_NONE;
     case GET_STATUS:
-        return get_status(xcp, response);
+        return get_status(xcp, context->store, response);
     case SYNCH:
         return XCP_ERROR_SYNCHRONISED;
     case GET_COMM_MODE_INFO:
@@ -208,7 +240,7 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, const
         response->length = MESSAGE_BYTES;
         return XCP_ERROR_NONE;
     case GET_ID:
-        return get_id(xcp, response);
+        return get_id(xcp, command, response);
     case SET_REQUEST:
         return set_request(xcp, context, command);
     case GET_SEED:
@@ -216,8 +248,7 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, const
     case UNLOCK:
         return unlock(xcp, command, time_us, response);
     case SET_MTA:
-        xcp->address = word_of(command + 4);
-        return command[3] == 0 ? XCP_ERROR_NONE : XCP_ERROR_OUT_OF_RANGE; /* the address's extension */
+        return set_address(xcp, command);
     case UPLOAD:
         return upload(xcp, context->parameters, command[1], response);
     case SHORT_UPLOAD:
@@ -225,7 +256,7 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, const
     case DOWNLOAD:
         return download(xcp, context, command);
     default:
-        return xcp_daq_command(xcp, command, response->data, &response->length);
+        return xcp_daq_command(xcp, command, bytes, response->data, &response->length);
     }
 }
 
@@ -238,14 +269,14 @@ bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp
     for (unsigned i = 0; i < frame->length; i++) {
         command[i] = frame->data[i];
     }
-    if (command[0] != CONNECT && !xcp->connected) { /* silent, as the standard asks */
+    const bool connects = command[0] == CONNECT && is_whole(command, frame->length);
+    if (!connects && !xcp->connected) { /* silent, as the standard asks */
         return false;
     }
     xcp->received_us = time_us;
     xcp->upload_left = 0; /* of an UPLOAD that the master has given up */
     message_t response = {.data = {RESPONSE}, .length = 1};
-    const xcp_error_t error =
-        command[0] == CONNECT ? connect(xcp, &response) : execute(xcp, hal, command, context, time_us, &response);
+    const xcp_error_t error = execute(xcp, hal, command, frame->length, context, time_us, &response);
     if (error != XCP_ERROR_NONE) {
         response = (message_t){.data = {ERROR, (uint8_t)error}, .length = 2};
     }
@@ -259,6 +290,9 @@ bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp
 void xcp_supervise(xcp_t *xcp, bool bus_off, uint32_t time_us) {
     if (xcp->connected && (bus_off || time_us - xcp->received_us > XCP_SILENT_US)) {
         end_session(xcp);
+    }
+    if (time_us - xcp->seed_us > XCP_SILENT_US) { /* its age is known modulo 2^32 us only */
+        xcp->seed = 0;
     }
 }
 

@@ -33,6 +33,16 @@ enum { FIRST_BYTES = 7, TIMESTAMP_BYTES = 2 };
 #define TIMESTAMP_MODE (TIMESTAMP_BYTES | 3u << 4)
 #define EVENT_PROPERTIES 0x04u /* of DAQ */
 
+/* Bytes of a command; 0: one. */
+static const uint8_t least_bytes[CLEAR_DAQ_LIST - ALLOC_ODT_ENTRY + 1] = {
+    [ALLOC_ODT_ENTRY - ALLOC_ODT_ENTRY] = 6,     [ALLOC_ODT - ALLOC_ODT_ENTRY] = 5,
+    [ALLOC_DAQ - ALLOC_ODT_ENTRY] = 4,           [GET_DAQ_EVENT_INFO - ALLOC_ODT_ENTRY] = 4,
+    [GET_DAQ_LIST_INFO - ALLOC_ODT_ENTRY] = 4,   [START_STOP_SYNCH - ALLOC_ODT_ENTRY] = 2,
+    [START_STOP_DAQ_LIST - ALLOC_ODT_ENTRY] = 4, [GET_DAQ_LIST_MODE - ALLOC_ODT_ENTRY] = 4,
+    [SET_DAQ_LIST_MODE - ALLOC_ODT_ENTRY] = 7,   [WRITE_DAQ - ALLOC_ODT_ENTRY] = 8,
+    [SET_DAQ_PTR - ALLOC_ODT_ENTRY] = 6,
+};
+
 static uint16_t half_word(const uint8_t *at) {
     return (uint16_t)(at[0] | at[1] << 8);
 }
@@ -54,7 +64,7 @@ void xcp_daq_stop(xcp_t *xcp) {
     xcp->daq.next_odt = xcp->daq.odts;
 }
 
-/* The commands that allocate come in this order; one that comes again begins its step anew. */
+/* The commands that allocate come in this order; before one comes again, all is freed. */
 static xcp_error_t allocate(xcp_daq_t *daq, const uint8_t *command) {
     const unsigned list = half_word(command + 2);
     switch (command[0]) {
@@ -68,7 +78,7 @@ static xcp_error_t allocate(xcp_daq_t *daq, const uint8_t *command) {
         if (list > 1) {
             return XCP_ERROR_MEMORY_OVERFLOW;
         }
-        daq->allocated = XCP_DAQ_LIST;
+        daq->allocated = list == 1 ? XCP_DAQ_LIST : XCP_DAQ_FREE;
         return XCP_ERROR_NONE;
     case ALLOC_ODT:
         if (daq->allocated != XCP_DAQ_LIST) {
@@ -128,9 +138,12 @@ static xcp_error_t write_entry(xcp_t *xcp, const uint8_t *command) {
 }
 
 static xcp_error_t set_mode(xcp_daq_t *daq, const uint8_t *command) {
-    if ((command[1] & ~MODE_TIMESTAMP) != 0 || half_word(command + 2) != 0 || half_word(command + 4) >= XCP_EVENTS ||
+    if (daq->allocated == XCP_DAQ_FREE || half_word(command + 2) != 0 || half_word(command + 4) >= XCP_EVENTS ||
         command[6] == 0) {
         return XCP_ERROR_OUT_OF_RANGE;
+    }
+    if ((command[1] & ~MODE_TIMESTAMP) != 0) {
+        return XCP_ERROR_MODE_NOT_VALID;
     }
     daq->timestamps = (command[1] & MODE_TIMESTAMP) != 0;
     daq->event = command[4];
@@ -177,8 +190,11 @@ static xcp_error_t start(xcp_t *xcp) {
 static xcp_error_t start_or_stop(xcp_t *xcp, const uint8_t *command, uint8_t *response, uint8_t *length) {
     xcp_daq_t *daq = &xcp->daq;
     if (command[0] == START_STOP_DAQ_LIST) {
-        if (half_word(command + 2) != 0 || daq->allocated != XCP_DAQ_ENTRIES || command[1] > SELECT) {
+        if (half_word(command + 2) != 0 || daq->allocated != XCP_DAQ_ENTRIES) {
             return XCP_ERROR_OUT_OF_RANGE;
+        }
+        if (command[1] > SELECT) {
+            return XCP_ERROR_MODE_NOT_VALID;
         }
         response[1] = 0; /* number of its first frame */
         *length = 2;
@@ -189,7 +205,7 @@ static xcp_error_t start_or_stop(xcp_t *xcp, const uint8_t *command, uint8_t *re
         return command[1] == START ? start(xcp) : XCP_ERROR_NONE;
     }
     if (command[1] > STOP_SELECTED) {
-        return XCP_ERROR_OUT_OF_RANGE;
+        return XCP_ERROR_MODE_NOT_VALID;
     }
     const bool selected = daq->selected;
     daq->selected = false;
@@ -254,8 +270,11 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
     }
 }
 
-xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, uint8_t *response, uint8_t *length) {
+xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, uint8_t *response, uint8_t *length) {
     const uint8_t code = command[0];
+    if (code >= ALLOC_ODT_ENTRY && code <= CLEAR_DAQ_LIST && bytes < least_bytes[code - ALLOC_ODT_ENTRY]) {
+        return XCP_ERROR_SYNTAX;
+    }
     if (code == GET_DAQ_PROCESSOR_INFO || code == GET_DAQ_RESOLUTION_INFO || code == GET_DAQ_EVENT_INFO ||
         code == GET_DAQ_LIST_INFO || code == GET_DAQ_LIST_MODE || code == GET_DAQ_CLOCK) {
         return describe(xcp, command, response, length);
