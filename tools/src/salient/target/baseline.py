@@ -11,6 +11,7 @@ from typing import Any
 
 from salient.bench.programs import image
 from salient.config import CONTROLLERS, TARGET_BUILDS
+from salient.drive_layout import Layout, layout_file
 from salient.elf import ElfImage
 from salient.errors import UsageError
 from salient.paths import BUILD, REFERENCE, ROOT
@@ -26,7 +27,7 @@ PAGE = REFERENCE / "cost.md"
 FLASH_MAX_BYTES = 80 * 1024
 """Limit of the firmware with the tables of one machine; cmake/check_size.cmake enforces it."""
 RAM_MAX_BYTES = 20 * 1024
-"""Limit of variables and stack, with the 2 KiB of the fault trace."""
+"""Limit of variables and stack, with the 2 KiB of the fault trace and without the triggered buffer."""
 
 BOUND_KEYS = {"cortex-m4": "computed_bound", "rv32": "computed_bound_rv32"}
 """Keys of the computed bounds in the tables of the interrupts, by build."""
@@ -39,13 +40,15 @@ Baseline = dict[str, dict[str, dict[str, int]]]
 
 def sizes(build: str) -> dict[str, int]:
     """Sizes in bytes of a build's ELF image and, where it exists, of the firmware alone (firmware.elf: linked like the
-    image, without port and C library). The stack sizes are upper bounds of the background and of each interrupt."""
+    image, without port and C library). ram: variables without the triggered buffer, whose size is a parameter of the
+    build (interrupts/sampler.h). The stack sizes are upper bounds of the background and of each interrupt."""
     whole = ElfImage(image(MACHINE, build))
     image_size = size(whole)
     alone = firmware_alone(build)
     background, interrupt, deferred = (deepest_stack(whole, function)[0]
                                        for function in ("program_start", "control_handler", "deferred_handler"))
-    result = {"flash": image_size.flash, "ram": image_size.ram, "stack_background": background,
+    buffer = len(Layout(layout_file(build)).bits("sampler.ring")) // 8
+    result = {"flash": image_size.flash, "ram": image_size.ram - buffer, "stack_background": background,
               "stack_deferred": deferred + whole.exception_frame_bytes,
               "stack_interrupt": interrupt + whole.exception_frame_bytes}
     return ({"firmware": size(ElfImage(alone)).flash} if alone.exists() else {}) | result
