@@ -33,7 +33,8 @@ def test_four_channels_are_the_recording_of_the_emulator_at_the_same_periods(mak
     truth = np.load(file)
 
     def deviation(shift):
-        """Largest difference of the angles, in counts of the encoder, when the buffer begins at a record of the truth."""
+        """Largest difference of the angles, in counts of the encoder, when the buffer begins at a record of the truth.
+        """
         true_deg = truth["rotor_angle_deg"][shift:shift + len(recording.time_s)]
         difference = recording["encoder_angle_deg"] - true_deg
         return float(np.max(np.abs((difference + 180.0) % 360.0 - 180.0))) / COUNT_DEG
@@ -170,7 +171,8 @@ def test_every_short_name_is_a_variable_with_the_unit_that_it_has():
 
 @pytest.mark.parametrize(("text", "level"), [
     ("current_a_A > 1", 513), ("current_a_A >= 1", 512), ("current_a_A < 1", 511), ("current_a_A <= 1", 512),
-    ("current_a_A rises to 1", 512), ("current_a_A falls to 1", 512), ("state == run", 2), ("state == DRIVE_STATE_RUN", 2),
+    ("current_a_A rises to 1", 512), ("current_a_A falls to 1", 512), ("state == run", 2),
+    ("state == DRIVE_STATE_RUN", 2),
 ])
 def test_level_of_a_trigger_is_the_raw_value_that_the_comparison_means(text, level):
     assert parse_trigger(text, Variables(machine="saturating")).level == level

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from salient.drive_layout import Layout, layout_file
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import flips
-from salient.drive_layout import Layout, layout_file
-from salient.experiments.campaign.runner import digest, program
+from salient.experiments.campaign.runner import digest
 from salient.experiments.campaign.runner import flips as run_flips
 
 SAMPLE = 25

@@ -26,7 +26,8 @@ C_LAYERS = (
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
-JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h", "emulator/qemu/image/main.c"}
+JOINS_FIRMWARE_AND_EMULATOR = {"emulator/host/host_drive.h", "emulator/host/memory_flip.h",
+                               "emulator/qemu/image/main.c"}
 
 PYTHON_LAYERS = (
     "salient", "salient.guard", "salient.errors", "salient.paths", "salient.workers", "salient.progress",

@@ -260,8 +260,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     evidence.add_argument("--run", action="store_true",
                           help="first run the commands of the claims that are red: hours, resumable")
 
-    scope = command("scope", "variables of a running drive at its control rate around a trigger, or the control periods "
-                    "before its last fault: table and plot")
+    scope = command("scope", "variables of a running drive at its control rate around a trigger, or the control "
+                    "periods before its last fault: table and plot")
     _add_can(scope)
     scope.add_argument("--signals", nargs="+", default=[], metavar="NAME",
                        help="variables, at most 8, as speed_rpm, current_a_A or control.observer.speed_q22 (--list); "

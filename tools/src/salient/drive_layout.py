@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from elftools.elf.elffile import ELFFile
+from elftools.elf.sections import SymbolTableSection
 
 from salient.errors import UsageError
 from salient.paths import BUILD
@@ -75,7 +76,7 @@ class Layout:
 
 def _word_at(elf: ELFFile, symbol: str) -> int:
     table = elf.get_section_by_name(".symtab")
-    for found in table.get_symbol_by_name(symbol) or () if table is not None else ():
+    for found in (table.get_symbol_by_name(symbol) or ()) if isinstance(table, SymbolTableSection) else ():
         section = elf.get_section(found["st_shndx"])
         begin = found["st_value"] - section["sh_addr"]
         return int.from_bytes(section.data()[begin:begin + 4], "little")

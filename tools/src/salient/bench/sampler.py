@@ -25,7 +25,7 @@ from salient.config import either
 from salient.errors import RunFailed, UsageError, close_names, shown
 
 if TYPE_CHECKING:
-    from pyxcp.master import Master
+    from pyxcp.master.master import Master
 
     from salient.bench.session import Session
 
@@ -169,8 +169,8 @@ class Scope:
 def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
         divider: int = 1, event: str = "control") -> Scope:
     """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th event, from the part
-    `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on. UsageError: one of these is wrong;
-    ScopeError: the drive's memory has another layout than the program here."""
+    `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on. UsageError: one of
+    these is wrong; ScopeError: the drive's memory has another layout than the program here."""
     variables = variables_of(session)
     if isinstance(signals, str) or not 1 <= len(signals) <= CHANNELS_MAX:
         raise UsageError(f"signals: must be 1 to {CHANNELS_MAX} names")
@@ -202,7 +202,7 @@ def _check(divider: Any, before: Any, event: str) -> None:
     if not isinstance(divider, int) or not 1 <= divider <= DIVIDER_MAX:
         raise UsageError(f"divider {shown(divider)}: must be a whole number from 1 to {DIVIDER_MAX}")
     if not isinstance(before, int | float) or not 0.0 <= before < 1.0:
-        raise UsageError(f"before {shown(before)}: must be from 0 to below 1, the part of the buffer before the trigger")
+        raise UsageError(f"before {shown(before)}: must be from 0 to below 1, the part before the trigger")
 
 
 @lru_cache

@@ -23,7 +23,7 @@ from salient.bus.signals import drive_database
 from salient.errors import RunFailed
 
 if TYPE_CHECKING:
-    from pyxcp.master import Master
+    from pyxcp.master.master import Master
 
 COMMAND_ID, RESPONSE_ID = (drive_database().get_message_by_name(name).frame_id
                            for name in ("XCP_COMMAND", "XCP_RESPONSE"))
@@ -104,7 +104,7 @@ def connected(session: Session) -> Iterator[Master]:
     """
     try:
         from pyxcp.config import create_application_from_config
-        from pyxcp.master import Master
+        from pyxcp.master.master import Master
         from pyxcp.types import XcpResponseError, XcpTimeoutError
     except ImportError:
         raise RunFailed(_INSTALL) from None
@@ -119,7 +119,7 @@ def connected(session: Session) -> Iterator[Master]:
     try:
         with master:
             master.connect()
-            master.cond_unlock()
+            master.cond_unlock()  # type: ignore[no-untyped-call]
             yield master
             master.disconnect()
     except (XcpResponseError, XcpTimeoutError) as error:

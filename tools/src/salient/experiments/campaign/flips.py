@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from salient.cli import shard
+from salient.drive_layout import Layout, layout_file
 from salient.errors import UsageError, exit_code
 from salient.experiments.campaign import names
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
-from salient.drive_layout import Layout, layout_file
-from salient.experiments.campaign.runner import Result, commit, digest, flips, program
+from salient.experiments.campaign.runner import Result, commit, digest, flips
 from salient.experiments.tasks import Task, check_build, run
 
 CONTROLLERS = ("traditional", "paper", "salient")
