@@ -343,6 +343,8 @@ TelemetryName = Literal[
     "PARAMETER_RESPONSE.status",
     "value",
     "PARAMETER_RESPONSE.value",
+    "packet",
+    "XCP_RESPONSE.packet",
     "firmware_major",
     "DRIVE_IDENTITY.firmware_major",
     "firmware_minor",

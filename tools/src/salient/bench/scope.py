@@ -1,7 +1,7 @@
 """The drive's records at its control rate, as table and plot: `tools/salient scope`. With signals they are made around
-a trigger (salient.bench.sampler). Without, it is the control periods up to the one that latched a fault, which the drive
-keeps from the fault to the next run. It does not keep the signals of other nodes: those are of the time in which the
-buffer is read."""
+a trigger (salient.bench.sampler). Without, it is the control periods up to the one that latched a fault, which the
+drive keeps from the fault to the next run. It does not keep the signals of other nodes: those are of the time in which
+the buffer is read."""
 
 from __future__ import annotations
 
