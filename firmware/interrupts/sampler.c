@@ -3,6 +3,7 @@
 #include <stddef.h>
 
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 /* The drive as words, whatever they belong to. */
 typedef const volatile uint32_t MAY_ALIAS memory_word_t;
@@ -64,9 +65,9 @@ static inline uint32_t next_place(const sampler_t *sampler, uint32_t end) {
     return end + sampler->record_words > SAMPLER_WORDS ? 0 : end;
 }
 
-static void write_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us) {
+static inline void write_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us) {
     const bool streams = sampler->state == SAMPLER_STREAMS;
-    const uint32_t channels = sampler->setup.channels % (SAMPLER_CHANNELS_MAX + 1u);
+    const uint32_t channels = fixed_min_u32(sampler->setup.channels, SAMPLER_CHANNELS_MAX);
     const uint32_t needed = channels + (streams ? 1u : 0u);
     uint32_t place = sampler->place;
     if (needed > SAMPLER_WORDS || place > SAMPLER_WORDS - needed) { /* changed in memory */

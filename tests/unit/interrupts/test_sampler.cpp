@@ -137,7 +137,7 @@ class Course {
             }
             EXPECT_EQ(sampler_.event, uint32_t(setup_.event));
             sampler_record(&sampler_, memory_.data(), WORDS, uint32_t(random_()));
-            if (trigger_record_ >= 0 && int64_t(records_.size()) == trigger_record_ + capacity() - setup_.before) {
+            if (trigger_record_ >= 0 && int64_t(records_.size()) == trigger_record_ + capacity() - before_) {
                 expect_complete();
                 return true;
             }
@@ -169,11 +169,11 @@ class Course {
 
     // Records that precede an event are those of earlier events.
     void expect_trigger(int64_t event) {
-        const bool enough = int64_t(records_.size()) >= setup_.before;
-        if (trigger_record_ < 0 && enough &&
+        if (trigger_record_ < 0 &&
             (event >= trigger_now_ || holds(setup_.condition, value_, level_, has_last_ ? &last_ : nullptr))) {
             trigger_record_ = (event + setup_.divider - 1) / setup_.divider;
             trigger_events_ = trigger_record_ * setup_.divider - event;
+            before_ = std::min(int64_t(setup_.before), int64_t(records_.size()));
         }
         last_ = value_;
         has_last_ = true;
@@ -185,10 +185,11 @@ class Course {
         EXPECT_EQ(sampler_.capacity, capacity());
         EXPECT_EQ(sampler_.record_words, setup_.channels);
         EXPECT_EQ(sampler_.trigger_events, trigger_events_);
+        EXPECT_EQ(sampler_.missing, setup_.before - before_);
         const auto words = uint32_t(capacity() * setup_.channels);
         ASSERT_LT(sampler_.place, words);
         uint32_t place = sampler_.place; // of the oldest record, which `before` others follow up to the trigger
-        for (int64_t k = trigger_record_ - setup_.before; k < int64_t(records_.size()); k++) {
+        for (int64_t k = trigger_record_ - before_; k < int64_t(records_.size()); k++) {
             for (unsigned i = 0; i < setup_.channels; i++, place++) {
                 ASSERT_EQ(sampler_.ring[place % words], records_[size_t(k)][setup_.word[i]]) << "record " << k;
             }
@@ -204,7 +205,7 @@ class Course {
     words_t memory_{};
     int64_t value_ = 0, last_ = 0;
     bool has_last_ = false;
-    int64_t trigger_record_ = -1, trigger_events_ = 0;
+    int64_t trigger_record_ = -1, trigger_events_ = 0, before_ = 0;
     std::vector<words_t> records_;
 };
 

@@ -155,6 +155,8 @@ TEST_F(Interrupted, arming_anew_begins_with_a_whole_record_whatever_was_recorded
     for (const bool streams : {false, true}) {
         sampler_setup_t setup = setup_of(3);
         setup.before = 5;
+        setup.condition = SAMPLER_EQUAL;
+        setup.level = 5; // which no value here is
         for (unsigned after = 1;; after++) {
             arm(streams ? 2 : 7, !streams, streams ? 1000 : 0);
             for (unsigned k = 0; k < 50; k++) {
