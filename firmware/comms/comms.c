@@ -69,13 +69,16 @@ COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parame
         frame.identifier += comms->telemetry.identifier_offset;
         frame_queue_push(&comms->responses, &frame);
     }
-    if (!comms->xcp.daq.running || frame_queue_peek(&comms->telemetry.queue) != NULL ||
-        frame_queue_peek(&comms->responses) != NULL) {
+    if (!comms->xcp.connected) {
         return;
     }
     hal_can_status_t status;
     hal_can_status(hal, &status);
-    if (xcp_next_frame(&comms->xcp, parameters, status.transmitting, &frame)) {
+    /* Frames of XCP keep mailboxes: that the heartbeat has left is seen before the next one. */
+    comms->telemetry.background_in_mailbox &= status.transmitting;
+    if (comms->xcp.daq.running && frame_queue_peek(&comms->telemetry.queue) == NULL &&
+        frame_queue_peek(&comms->responses) == NULL &&
+        xcp_next_frame(&comms->xcp, parameters, status.transmitting, &frame)) {
         frame.identifier += comms->telemetry.identifier_offset;
         hal_can_transmit(hal, &frame);
     }
