@@ -6,9 +6,9 @@
  * A port defines `struct hal` and every function of hal_adc.h, hal_can.h, hal_encoder.h, hal_interrupt.h, hal_nvm.h,
  * hal_pwm.h, hal_random.h, hal_time.h and hal_watchdog.h. It calls drive_control_interrupt once per control period,
  * from an interrupt that the PWM timer triggers, drive_deferred_interrupt once for each request of
- * hal_interrupt_request_deferred, and drive_background from its main loop. The firmware only holds a pointer to the
- * port's structure, so several drives can share a process. Ports: emulator/host (the emulated board), hal/qemu (boards
- * of QEMU).
+ * hal_interrupt_request_deferred, and drive_background from its main loop. Each call of the firmware is given a
+ * pointer to the port's structure, so several drives can share a process. Ports: emulator/host (the emulated board),
+ * hal/qemu (boards of QEMU).
  *
  * Each function states the contexts from which it may be called: [control interrupt], [deferred interrupt],
  * [background], the main loop, or [any] of the three. The control interrupt pre-empts the deferred interrupt and the

@@ -10,15 +10,18 @@ static_assert((int)DRIVE_CONTROLLER_TRADITIONAL == OPTIONS_CONTROLLER_TRADITIONA
               "the record and the drive number the controllers differently");
 
 static void control_interrupt(void *context) {
-    drive_control_interrupt(&((host_drive_t *)context)->drive);
+    host_drive_t *host = context;
+    drive_control_interrupt(&host->drive, &host->hal);
 }
 
 static void deferred_interrupt(void *context) {
-    drive_deferred_interrupt(&((host_drive_t *)context)->drive);
+    host_drive_t *host = context;
+    drive_deferred_interrupt(&host->drive, &host->hal);
 }
 
 static void background(void *context) {
-    drive_background(&((host_drive_t *)context)->drive);
+    host_drive_t *host = context;
+    drive_background(&host->drive, &host->hal);
 }
 
 static void restart(void *context) {

@@ -13,11 +13,19 @@
 
 void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
     const uint32_t offset = node * NODE_STEP;
-    *comms = (comms_t){0};
+    *comms = (comms_t){.node_offset = offset};
     bus_monitor_init(&comms->bus, time_us);
     commands_init(&comms->commands);
     comms->commands.data_id_offset = (uint16_t)offset;
     telemetry_init(&comms->telemetry, offset, time_us);
+}
+
+/* A bit that has changed in one copy is that of both others again. */
+static void restore_node(comms_t *comms) {
+    const uint32_t sends = comms->telemetry.identifier_offset, hears = comms->commands.data_id_offset;
+    const uint32_t offset = (sends & hears) | (comms->node_offset & (sends | hears));
+    comms->telemetry.identifier_offset = comms->node_offset = offset;
+    comms->commands.data_id_offset = (uint16_t)offset;
 }
 
 static void report_arming(comms_t *comms, hal_t *hal, uint32_t time_us) {
@@ -86,8 +94,8 @@ COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parame
 
 /* Handles a parameter request or a frame of a set. Without room for its response a frame is dropped: commands behind it
  * must not wait. */
-static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *parameters,
-                               const parameters_conditions_t *conditions, const hal_can_frame_t *frame) {
+static void receive_parameters(comms_t *comms, hal_t *hal, const comms_objects_t *objects,
+                               const hal_can_frame_t *frame) {
     arming_t *arming = &comms->commands.arming;
     if (frame->identifier == DRIVE_PARAMETER_WRITE_FRAME_ID) { /* has none */
         parameter_set_write(&comms->set, frame);
@@ -99,25 +107,25 @@ static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *paramet
     }
     hal_can_frame_t response;
     if (frame->identifier == DRIVE_PARAMETER_SET_CONTROL_FRAME_ID) {
-        if (parameter_set_control(&comms->set, arming->configuring != 0, parameters, comms->store, conditions, frame,
-                                  &response)) {
+        if (parameter_set_control(&comms->set, arming->configuring != 0, objects->parameters, objects->store,
+                                  &objects->conditions, frame, &response)) {
             arming_end_configuration(arming);
         }
-    } else if (!memory_protocol_respond(comms->store, comms->self_test, hal, frame, &response) &&
-               !trace_protocol_respond(comms->trace, comms->control_parameters, frame, &response)) {
-        parameter_protocol_respond(parameters, frame, &response);
+    } else if (!memory_protocol_respond(objects->store, objects->self_test, hal, frame, &response) &&
+               !trace_protocol_respond(objects->trace, objects->control_parameters, frame, &response)) {
+        parameter_protocol_respond(objects->parameters, frame, &response);
     }
     response.identifier += comms->telemetry.identifier_offset;
     frame_queue_push(&comms->responses, &response);
 }
 
-static void receive_xcp(comms_t *comms, hal_t *hal, parameters_t *parameters,
-                        const parameters_conditions_t *conditions, const hal_can_frame_t *frame, uint32_t time_us) {
+static void receive_xcp(comms_t *comms, hal_t *hal, const comms_objects_t *objects, const hal_can_frame_t *frame,
+                        uint32_t time_us) {
     if (frame_queue_free(&comms->responses) == 0) {
         counter_add(&comms->telemetry.dropped, 1);
         return;
     }
-    const xcp_context_t context = {parameters, conditions, &comms->set, comms->store};
+    const xcp_context_t context = {objects->parameters, &objects->conditions, &comms->set, objects->store};
     hal_can_frame_t response;
     if (xcp_receive(&comms->xcp, hal, frame, &context, time_us, &response)) {
         response.identifier += comms->telemetry.identifier_offset;
@@ -125,8 +133,7 @@ static void receive_xcp(comms_t *comms, hal_t *hal, parameters_t *parameters,
     }
 }
 
-static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
-                    uint32_t timeout_us, uint32_t time_us) {
+static bool receive(comms_t *comms, hal_t *hal, const comms_objects_t *objects, uint32_t timeout_us, uint32_t time_us) {
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL; i++) {
         if (!hal_can_receive(hal, &frame)) {
@@ -144,10 +151,10 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
             return true;
         case COMMANDS_PARAMETER_REQUEST:
         case COMMANDS_PARAMETER_SET:
-            receive_parameters(comms, hal, parameters, conditions, &frame);
+            receive_parameters(comms, hal, objects, &frame);
             break;
         case COMMANDS_XCP:
-            receive_xcp(comms, hal, parameters, conditions, &frame, time_us);
+            receive_xcp(comms, hal, objects, &frame, time_us);
             break;
         case COMMANDS_ACCEPTED:
         case COMMANDS_REJECTED:
@@ -160,8 +167,10 @@ static bool receive(comms_t *comms, hal_t *hal, parameters_t *parameters, const 
     return false;
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
-                      drive_state_t state, uint32_t time_us) {
+bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects, drive_state_t state,
+                      uint32_t time_us) {
+    const parameters_t *parameters = objects->parameters;
+    restore_node(comms);
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
     xcp_supervise(&comms->xcp, comms->bus.status.state == HAL_CAN_BUS_OFF, time_us);
@@ -170,13 +179,14 @@ bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, cons
                          (unsigned)parameters->values[PARAMETER_TELEMETRY_PERIOD_MS]);
     telemetry_set_period(&comms->telemetry, DRIVE_TELEMETRY_RATE_SLOW,
                          (unsigned)parameters->values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS]);
-    const bool commanded = receive(comms, hal, parameters, conditions, timeout_us, time_us);
+    const bool commanded = receive(comms, hal, objects, timeout_us, time_us);
     flush(comms, hal, time_us);
     send_xcp(comms, hal, parameters);
     return commanded;
 }
 
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
+    restore_node(comms);
     comms->telemetry.background_in_mailbox &= comms->bus.status.transmitting;
     telemetry_cycle(&comms->telemetry, values);
     comms->response_first = comms->telemetry.backlog;

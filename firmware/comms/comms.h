@@ -9,7 +9,7 @@
  *         ... collect a drive_telemetry_t, with the control interrupt masked ...
  *         comms_telemetry(&comms, hal, &values);
  *     }
- *     if (comms_background(&comms, hal, &parameters, &conditions, state, time_us)) {
+ *     if (comms_background(&comms, hal, &objects, state, time_us)) {
  *         ... execute comms.command ...
  *     }
  */
@@ -49,12 +49,19 @@ typedef struct {
     parameter_set_t set;     /* staged */
     xcp_t xcp;               /* initialised by the caller after comms_init */
     command_t command;       /* last accepted command */
-    nvm_store_t *store;      /* this and the next three are set by the caller after comms_init */
+    uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
+    uint32_t node_offset;    /* of identifiers and data IDs; the other two copies are in telemetry and commands */
+} comms_t;
+
+/* Objects that requests read or change, for one call. */
+typedef struct {
+    parameters_t *parameters;
+    parameters_conditions_t conditions; /* for a set of parameters to be applied now */
+    nvm_store_t *store;
     const fault_trace_t *trace;
     const self_test_t *self_test;
     const control_parameters_t *control_parameters;
-    uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
-} comms_t;
+} comms_objects_t;
 
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
 void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
@@ -71,9 +78,10 @@ void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
  * Of a frame that is neither command nor request, the identifier may be one of the drive's own (comms->bus). Frames of
  * the traffic of other nodes are ignored (comms/node.h).
  *
- * conditions: for a set of parameters to be applied now. [background] */
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
-                      drive_state_t state, uint32_t time_us);
+ * Who is heard and by which identifiers the drive sends is its node's: of the three copies of its offset a call of this
+ * or the next function begins with the majority of each bit. [background] */
+bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects, drive_state_t state,
+                      uint32_t time_us);
 
 /* True when comms_telemetry is due. [background] */
 static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {

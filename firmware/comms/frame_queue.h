@@ -1,4 +1,5 @@
-/* A ring of CAN frames that wait for a transmit mailbox: first in, first out. */
+/* A ring of CAN frames that wait for a transmit mailbox: first in, first out. An index or a count that has changed in
+ * memory leaves other frames in the ring, and reaches none outside of it. */
 #ifndef COMMS_FRAME_QUEUE_H
 #define COMMS_FRAME_QUEUE_H
 
@@ -18,7 +19,7 @@ typedef struct {
 
 /* Number of free places. */
 static inline unsigned frame_queue_free(const frame_queue_t *queue) {
-    return FRAME_QUEUE_CAPACITY - (unsigned)queue->count;
+    return queue->count < FRAME_QUEUE_CAPACITY ? FRAME_QUEUE_CAPACITY - (unsigned)queue->count : 0;
 }
 
 /* Appends a frame to a queue that is not full. */
@@ -29,7 +30,7 @@ static inline void frame_queue_push(frame_queue_t *queue, const hal_can_frame_t 
 
 /* The oldest frame; NULL when the queue is empty. */
 static inline const hal_can_frame_t *frame_queue_peek(const frame_queue_t *queue) {
-    return queue->count == 0 ? NULL : &queue->frames[queue->first];
+    return queue->count == 0 ? NULL : &queue->frames[queue->first % FRAME_QUEUE_CAPACITY];
 }
 
 /* Removes the oldest frame of a queue that is not empty. */

@@ -41,9 +41,10 @@ COLD void telemetry_set_period(telemetry_t *telemetry, drive_telemetry_rate_t ra
     telemetry->period[rate] = (uint16_t)period;
 }
 
-/* Counts down the cycles to a message; true when it is due now. */
+/* Counts down the cycles to a message; true when it is due now. More cycles than the period has are those of a count
+ * that has changed in memory. */
 static bool count_down(uint16_t *cycles_left, uint16_t period) {
-    const bool due = *cycles_left == 0;
+    const bool due = *cycles_left == 0 || *cycles_left > period;
     *cycles_left = (uint16_t)((due ? period : *cycles_left) - 1);
     return due;
 }
@@ -127,7 +128,11 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
 
     uint32_t cycles = 1;
     /* Negative when the values were collected a little before the cycle was due. */
-    const int32_t late_us = (int32_t)(values->status.time_us - telemetry->next_us);
+    int32_t late_us = (int32_t)(values->status.time_us - telemetry->next_us);
+    if (late_us < 0) { /* changed in memory: telemetry_due() */
+        telemetry->next_us = values->status.time_us;
+        late_us = 0;
+    }
     if (late_us >= TELEMETRY_CYCLE_US) {
         cycles += (uint32_t)late_us / TELEMETRY_CYCLE_US;
     }

@@ -57,9 +57,9 @@ void telemetry_init(telemetry_t *telemetry, uint32_t identifier_offset, uint32_t
 /* Sets the period of the messages of a rate, not `fixed`, in cycles, 1..1000. [background] */
 void telemetry_set_period(telemetry_t *telemetry, drive_telemetry_rate_t rate, unsigned period);
 
-/* True when a cycle is due. */
+/* True when a cycle is due. No cycle is further ahead than one: such a time has changed in memory. */
 static inline bool telemetry_due(const telemetry_t *telemetry, uint32_t time_us) {
-    return (int32_t)(time_us - telemetry->next_us) >= 0;
+    return telemetry->next_us - time_us - 1u >= TELEMETRY_CYCLE_US;
 }
 
 /* Queues the frames of one cycle and sets the time of the next one on the grid that began at start; cycles that were

@@ -75,8 +75,15 @@ static void identify(xcp_t *xcp) {
 }
 
 void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {
-    *xcp = (xcp_t){.memory = memory, .words = words, .sampler = sampler};
+    *xcp = (xcp_t){0};
+    xcp_attach(xcp, memory, words, sampler);
     identify(xcp);
+}
+
+void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {
+    xcp->memory = memory;
+    xcp->words = words;
+    xcp->sampler = sampler;
 }
 
 static void end_session(xcp_t *xcp) {

@@ -117,6 +117,10 @@ typedef struct {
 /* No session. memory: the drive, aligned as its words are. */
 void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler);
 
+/* As of xcp_init. Call it in each pass of the background before the functions below: nothing that memory holds alone is
+ * a pointer. [background] */
+void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler);
+
 /* Takes an XCP_COMMAND and writes its response; false when there is none. [background] */
 bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp_context_t *context, uint32_t time_us,
                  hal_can_frame_t *response);

@@ -60,6 +60,12 @@ static conduction_place_t place_of(const machine_tables_t *tables, const conduct
     return (conduction_place_t){index_q8 >> 8, (int32_t)(index_q8 & 0xFF)};
 }
 
+/* Point of a place that an earlier step has found: one that has changed in memory is the last with another behind it.
+ */
+static unsigned point_of(conduction_place_t place) {
+    return fixed_min_u32(place.k, MACHINE_PULSE_POINTS - 2);
+}
+
 /* Between two values of a table, Q8 of their unit: angles in 2^-24 electrical rev, torques in Q16, flux linkage in Q21.
  */
 static int32_t between_q8(int32_t low, int32_t high, int32_t fraction_q8) {
@@ -98,6 +104,11 @@ static void look_up(conduction_state_t *state, conduction_update_t *update, cons
     state->braking = braking;
 }
 
+/* CONDUCTION_MOTORING or CONDUCTION_BRAKING, whatever has changed in memory. */
+static unsigned half_of(const conduction_state_t *state) {
+    return state->braking != 0 ? CONDUCTION_BRAKING : CONDUCTION_MOTORING;
+}
+
 /* At the level 0 and 1 within 2 LSB of from and to. */
 static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
     return from + 4 * (uint32_t)fixed_multiply_high((int32_t)(to - from), level_q15 << 15);
@@ -120,8 +131,8 @@ static conduction_sharing_t sharing_for_torque(const machine_tables_t *tables, c
     const int32_t place_q8 = fixed_clamp(quarters_q8 - ONE_Q8, 0, (MACHINE_SHARING_PARTS - 1) * ONE_Q8);
     const int32_t k = place_q8 < (MACHINE_SHARING_PARTS - 1) * ONE_Q8 ? place_q8 >> 8 : MACHINE_SHARING_PARTS - 2;
     const int32_t part_q8 = place_q8 - k * ONE_Q8;
-    const machine_sharing_window_t *still = &tables->sharing[state->braking][0][k];
-    const machine_sharing_window_t *base = &tables->sharing[state->braking][1][k];
+    const machine_sharing_window_t *still = &tables->sharing[half_of(state)][0][k];
+    const machine_sharing_window_t *base = &tables->sharing[half_of(state)][1][k];
     return (conduction_sharing_t){
         .on = (uint32_t)between_windows(still[0].on, still[1].on, base[0].on, base[1].on, part_q8, speed_q8) << 8,
         .off = (uint32_t)between_windows(still[0].off, still[1].off, base[0].off, base[1].off, part_q8, speed_q8) << 8,
@@ -130,12 +141,13 @@ static conduction_sharing_t sharing_for_torque(const machine_tables_t *tables, c
 
 /* Pulse for an index of the tables, or above them for the largest mean torque. */
 static conduction_partial_pulse_t pulse_at(const machine_tables_t *tables, const conduction_update_t *update,
-                                           bool braking, unsigned index) {
+                                           unsigned half, unsigned index) {
     const conduction_pulse_t *largest = &update->pulse;
     if (index == MACHINE_PULSE_PARTS) {
         return (conduction_partial_pulse_t){-largest->lead, largest->end, largest->peak_q24 - largest->mean_q24};
     }
-    const machine_partial_pulse_t *low = &tables->partial_pulse[braking][index][update->place.k], *high = low + 1;
+    const unsigned k = point_of(update->place);
+    const machine_partial_pulse_t *low = &tables->partial_pulse[half][index][k], *high = low + 1;
     const int32_t fraction_q8 = update->place.fraction_q8;
     const int32_t ripple_q15 = between_q8(low->ripple, high->ripple, fraction_q8) - MACHINE_RIPPLE_OFFSET * ONE_Q8;
     return (conduction_partial_pulse_t){
@@ -147,14 +159,14 @@ static conduction_partial_pulse_t pulse_at(const machine_tables_t *tables, const
 
 /* Below the least part of the tables with its angles, and less ripple. */
 static conduction_partial_pulse_t partial_pulse(const machine_tables_t *tables, const conduction_update_t *update,
-                                                bool braking, int32_t part_q15) {
+                                                unsigned half, int32_t part_q15) {
     const unsigned quarter = (unsigned)part_q15 >> 13;
     const unsigned above = quarter < MACHINE_PULSE_PARTS ? quarter : MACHINE_PULSE_PARTS;
-    conduction_partial_pulse_t low = pulse_at(tables, update, braking, above > 0 ? above - 1 : 0);
+    conduction_partial_pulse_t low = pulse_at(tables, update, half, above > 0 ? above - 1 : 0);
     if (above == 0) {
         low.ripple_q24 = 0;
     }
-    const conduction_partial_pulse_t high = pulse_at(tables, update, braking, above);
+    const conduction_partial_pulse_t high = pulse_at(tables, update, half, above);
     const int32_t fraction_q15 = (part_q15 - (int32_t)(above << 13)) * 4;
     return (conduction_partial_pulse_t){
         .on = blend(low.on, high.on, fraction_q15),
@@ -422,7 +434,8 @@ static void set_window(const conduction_parameters_t *parameters, conduction_int
 
 /* Flux linkage that a braking phase may keep. */
 static void set_envelope(const machine_tables_t *tables, conduction_place_t place, conduction_half_t *braking) {
-    const uint16_t *end = &tables->braking_end[place.k], *flux = &tables->braking_flux[place.k];
+    const unsigned k = point_of(place);
+    const uint16_t *end = &tables->braking_end[k], *flux = &tables->braking_flux[k];
     const int32_t fraction_q8 = place.fraction_q8;
     const uint32_t flux_q29 = (uint32_t)between_q8(flux[0], flux[1], fraction_q8) << 8;
     braking->end = -angle(end[0], end[1], fraction_q8);
@@ -434,8 +447,9 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     const int32_t level_q15 = state->level_q15;
     const unsigned next = state->latest == 0 ? 1 : 0;
     conduction_t *angles = &state->angles[next];
-    conduction_half_t *half = &angles->half[state->braking];
-    conduction_half_t *before = &angles->half[!state->braking];
+    const unsigned own = half_of(state);
+    conduction_half_t *half = &angles->half[own];
+    conduction_half_t *before = &angles->half[own ^ 1u];
     const uint32_t on = update->interval.on;
     angles->ripple_q24 = negative ? fixed_subtract(0, update->ripple_q24) : update->ripple_q24;
     before->window = parameters->initial.half[0].window;
@@ -445,7 +459,7 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     angles->half[CONDUCTION_BRAKING].end = HALF_REV;
     before->flux = half->flux = 0;
     half->lead = 0;
-    set_window(parameters, update->interval, state->braking, state->partial_q15 > 0, &half->window);
+    set_window(parameters, update->interval, state->braking != 0, state->partial_q15 > 0, &half->window);
     if (state->braking && (level_q15 > 0 || state->partial_q15 > 0)) {
         set_envelope(tables, update->place, half);
     }
@@ -479,7 +493,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         state->above_base_q15 = above_base_q15(tables, update->place);
         state->partial_q15 = parameters->single_pulse ? state->above_base_q15 : 0;
         if (state->partial_q15 > 0) {
-            update->partial = partial_pulse(tables, update, state->braking, state->part_q15);
+            update->partial = partial_pulse(tables, update, half_of(state), state->part_q15);
         }
         break;
     case CONDUCTION_POSITIONS:

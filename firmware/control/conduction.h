@@ -178,7 +178,7 @@ typedef struct {
     int32_t torque_max_q24;
     int32_t gain_excess_q31; /* reduction of the speed law's gain, part of it, Q0.31, >= 0 */
     /* Both laws. */
-    bool braking;            /* torque against the rotation */
+    uint8_t braking;         /* torque against the rotation, when it is not 0 */
     int32_t torque_q24;      /* reference by magnitude, above base speed smoothed, N m, Q7.24 */
     int32_t missing_sum_q21; /* reference less estimated torque, of all steps of an update, N m, Q10.21 */
     int32_t trim_q30;        /* of the level or the part, Q1.30, -1..1 */
@@ -247,7 +247,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
 /* Angles of the update with an index. */
 static inline const conduction_t *conduction_angles(const conduction_parameters_t *parameters,
                                                     const conduction_state_t *state, unsigned index) {
-    return index == CONDUCTION_INITIAL ? &parameters->initial : &state->angles[index];
+    return index >= CONDUCTION_INITIAL ? &parameters->initial : &state->angles[index];
 }
 
 #endif

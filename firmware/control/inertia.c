@@ -69,6 +69,13 @@ static int32_t scaled(int32_t value, int32_t k) {
     return fixed_min(value, max) << -k;
 }
 
+/* A shift beyond its limits has not been identified: it has changed in memory. */
+static void limit_shift(inertia_t *inertia) {
+    if ((uint32_t)(inertia->shift - SHIFT_MIN) > SHIFT_MAX - SHIFT_MIN) {
+        inertia->shift = 0;
+    }
+}
+
 static void set_laws(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
     inertia->laws = (inertia_laws_t){
         .observer = load_observer_inertia(model, inertia->shift),
@@ -88,10 +95,12 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
     inertia->angle = angle;
     inertia->torque_mean_q23 = inertia->acceleration_mean_q23 = 0;
     inertia->torque_variance_q14 = inertia->acceleration_variance_q14 = inertia->covariance_q14 = 0;
+    limit_shift(inertia);
     set_laws(parameters, model, inertia);
 }
 
 COLD void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
+    limit_shift(inertia);
     set_laws(parameters, model, inertia);
 }
 
@@ -175,6 +184,7 @@ void inertia_step(const inertia_parameters_t *parameters, const load_observer_mo
         measure(parameters, inertia, angle);
         correlate(inertia, windows);
     } else if (update == 1 && windows > 1) { /* the rotation before the first window is unknown */
+        limit_shift(inertia);
         judge(parameters, inertia, windows);
         set_laws(parameters, model, inertia);
     }

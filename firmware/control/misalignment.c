@@ -119,7 +119,7 @@ static inline int32_t growing_mean_q16(const misalignment_parameters_t *paramete
 
 /* The phase to update; the next one is that of the next step. */
 static inline misalignment_phase_t *take_phase(misalignment_t *misalignment, const machine_tables_t *tables) {
-    const unsigned index = misalignment->phase_index;
+    const unsigned index = misalignment_phase_index(misalignment);
     misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;
     misalignment_phase_t *phase = &misalignment->phase[index];
     IN_REGISTER(phase);

@@ -135,6 +135,11 @@ typedef struct {
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);
 
+/* The phase of the next step. An index that has changed in memory is none beyond the phases. */
+static inline unsigned misalignment_phase_index(const misalignment_t *misalignment) {
+    return misalignment->phase_index % HAL_PHASES_MAX;
+}
+
 /* y in N m, Q7.24, from J / Ts (misalignment_parameters_t), load torque (N m, Q7.24) and speed correction (rad/s,
  * Q9.22) of the load observer. The product is rounded to nearest and saturates to within 4 N m of the end; the
  * difference saturates. */

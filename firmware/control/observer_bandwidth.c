@@ -156,7 +156,8 @@ static unsigned adaptive_stage(const observer_bandwidth_parameters_t *parameters
     bandwidth->ticks = (uint32_t)fixed_add((int32_t)bandwidth->ticks, 1);
     /* One stage a sample: the ends of stages are further apart, but for those that already have the steady bandwidth.
      */
-    const unsigned next = bandwidth->stage + (bandwidth->ticks >= parameters->stage[bandwidth->stage].end_ticks);
+    const unsigned next =
+        bandwidth->stage + (bandwidth->ticks >= observer_bandwidth_stage(parameters, bandwidth->stage)->end_ticks);
     const unsigned last = LAST_STAGE - limits->withheld_stages;
     bandwidth->stage = fixed_min_u32(next, last);
     if (fixed_magnitude(innovation) > threshold_of(&parameters->schedule, limits->threshold_mean, from_edge) &&
@@ -177,7 +178,7 @@ const load_observer_gains_t *observer_bandwidth_step(const observer_bandwidth_pa
     const unsigned stage = parameters->schedule.adaptive
                                ? adaptive_stage(parameters, bandwidth, limits, innovation, from_edge)
                                : LAST_STAGE;
-    return &parameters->stage[stage].gains;
+    return &observer_bandwidth_stage(parameters, stage)->gains;
 }
 
 void observer_bandwidth_update(const observer_bandwidth_schedule_t *schedule,

@@ -49,6 +49,7 @@
 #include <stdint.h>
 
 #include "control/load_observer.h"
+#include "fixed/fixed.h"
 
 /* Stages of the decay, each with 13/16 of the bandwidth before, but for the last ones: the steady bandwidth, and that
  * of a beat, which is withheld without one. */
@@ -134,6 +135,12 @@ typedef struct {
 
 /* Schedule of the settings, limited to what the encoder allows. */
 observer_bandwidth_parameters_t observer_bandwidth_configure(const observer_bandwidth_settings_t *settings);
+
+/* A stage; the last one for a number beyond, which has changed in memory. */
+static inline const observer_bandwidth_stage_t *
+observer_bandwidth_stage(const observer_bandwidth_parameters_t *parameters, unsigned stage) {
+    return &parameters->stage[fixed_min_u32(stage, OBSERVER_BANDWIDTH_BEAT_STAGE)];
+}
 
 /* Starts at the transient bandwidth: the initial estimate is unknown. */
 void observer_bandwidth_reset(observer_bandwidth_t *bandwidth);

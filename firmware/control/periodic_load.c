@@ -107,7 +107,7 @@ static int32_t mean_over_pitch_q8(const periodic_load_parameters_t *parameters, 
 }
 
 static void end_value(const periodic_load_parameters_t *parameters, periodic_load_t *load, int32_t lag) {
-    const uint32_t index = load->index;
+    const uint32_t index = load->index % VALUES;
     const int32_t residual_q8 = load->sum_q8 / load->updates;
     const int32_t estimate_q8 = residual_q8 + (load->mode == PERIODIC_LOAD_CLEAR ? 0 : load->profile_q8[index]);
     load->total_q8 += residual_q8;
@@ -143,7 +143,7 @@ void periodic_load_step(const periodic_load_parameters_t *parameters, periodic_l
     }
     const int32_t lag = angle_step * parameters->lag_periods;
     const uint32_t index = (sample->angle - (uint32_t)lag) >> VALUE_SHIFT;
-    if (load->count == VALUES) {
+    if (load->count >= VALUES) {
         end_turn(parameters, load);
     } else if (index != load->index) {
         const uint32_t direction = angle_step < 0 ? UINT32_MAX : 1u;
@@ -177,13 +177,13 @@ static int32_t extended_q8(periodic_load_range_t *range, int32_t value_q8) {
 }
 
 void periodic_load_review(periodic_load_t *load) {
-    const uint32_t ended = load->reviewed_index;
+    const uint32_t ended = load->reviewed_index % VALUES;
     load->reviewed_index = load->index;
     if (!load->engaged) {
         load->reviewed = false;
         return;
     }
-    if (load->index == ended) {
+    if (load->reviewed_index == ended) {
         return;
     }
     /* The value that was the present one has ended, and still has the profile of then. */

@@ -257,12 +257,11 @@ static inline int32_t duty_of(const plan_t *p, duty_divisor_t by, unsigned flux_
     return above_current_limit && duty > 0 ? 0 : duty; /* no positive voltage */
 }
 
-/* Column in which the next plan begins: the current changes as from the last plan to this one. */
-static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p,
-                                      int32_t column_max) {
+/* Column in which the next plan begins: the current changes as from the last plan to this one. Within 2 (40 + 4) + 4
+ * columns of either sign, and limited to those of the tables where it is used. */
+static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p) {
     const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : START_Q13;
-    control->column[phase] =
-        (uint8_t)fixed_clamp((2 * position_q13 - control->position_q13[phase]) >> 13, 0, column_max);
+    control->column[phase] = (int8_t)((2 * position_q13 - control->position_q13[phase]) >> 13);
     control->position_q13[phase] = position_q13;
 }
 
@@ -303,8 +302,8 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const period_t period = {(uint32_t)flux_step_max_q29 >> flux_shift, (sample->angle_step >> 8) + 1};
 
     plan_t plan[HAL_PHASES_MAX];
-    phase_cell_t *cells = control->cell[control->turn]; /* those of this sample have served */
-    control->turn ^= 1;
+    phase_cell_t *cells = control->cell[control->turn & 1u]; /* those of this sample have served */
+    control->turn++;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;
     UNROLL(4)
@@ -314,7 +313,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         const uint32_t angle = sample->angle - phase * parameters->stroke - (uint32_t)sample->misalignment[phase];
         const bool positive = angle >= HALF_REV;
         p->angle = positive ? angle : ~angle; /* mirrored, to 1 LSB */
-        p->column = control->column[phase];
+        p->column = fixed_clamp(control->column[phase], 0, parameters->column_max);
         p->cell = &cells[phase];
         p->cell->sign = (int8_t)(2 * (int)positive - 1);
         const bool outgoing = positive == sample->reverse;
@@ -324,8 +323,9 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         shortfall = fixed_subtract(shortfall, p->cell->sign * p->torque);
     }
 
-    if (!LIKELY(sample->lost_phase == 0)) {
-        shortfall = drop_plan(&plan[sample->lost_phase - 1u], shortfall);
+    const uint32_t lost = sample->lost_phase - 1u; /* UINT32_MAX: none */
+    if (!LIKELY(lost >= phases)) {
+        shortfall = drop_plan(&plan[lost], shortfall);
         reached = false;
     }
     control->torque_shortfall_q24 = 0;
@@ -343,6 +343,6 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
         const bool above_current_limit = sample->current_q9[phase] > parameters->current_max_q9;
         duty_q15[phase] = duty_of(&plan[phase], by, flux_shift, above_current_limit);
         control->duty_q15[phase] = duty_q15[phase];
-        extrapolate_column(control, phase, &plan[phase], parameters->column_max);
+        extrapolate_column(control, phase, &plan[phase]);
     }
 }

@@ -64,9 +64,9 @@ typedef struct {
     int32_t duty_q15[HAL_PHASES_MAX];     /* acts from the coming sample on, Q1.15 */
     int32_t torque_shortfall_q24;         /* reference less planned torque, N m, Q7.24; 0 within 1/64 N m */
     int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
-    uint8_t column[HAL_PHASES_MAX];       /* table column in which the next plan begins */
+    int8_t column[HAL_PHASES_MAX];        /* table column in which the next plan begins, before it is limited */
     phase_cell_t cell[2][HAL_PHASES_MAX]; /* of the plans for this sample and for the next one, in turn */
-    unsigned turn;                        /* index of those for this sample */
+    unsigned turn;                        /* its lowest bit: index of those for this sample */
 } predictive_torque_t;
 
 typedef struct {
@@ -90,7 +90,7 @@ void predictive_torque_reset(predictive_torque_t *control);
 
 /* Cells by phase that were planned for the sample of predictive_torque_estimate. */
 ALWAYS_INLINE const phase_cell_t *predictive_torque_cells(const predictive_torque_t *control) {
-    return control->cell[control->turn];
+    return control->cell[control->turn & 1u];
 }
 
 /* Torque and flux linkage of a phase at a sample, in units of the tables, from its current in A, Q7.9, in the cell that

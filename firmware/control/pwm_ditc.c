@@ -185,7 +185,7 @@ void pwm_ditc_step(const pwm_ditc_parameters_t *parameters, pwm_ditc_t *ditc, co
         return;
     }
 
-    if (ditc->regulated == COMMUTATION_NONE) {
+    if (ditc->regulated >= COMMUTATION_NONE) {
         /* From standstill: a phase past its window still has torque, the one that just entered has none. */
         ditc->regulated = outgoing != COMMUTATION_NONE ? outgoing : active;
     }

@@ -109,7 +109,7 @@ void stroke_mean_review(const stroke_mean_parameters_t *parameters, stroke_mean_
     const int32_t half_q24 = (int32_t)((uint32_t)(ended->half / (int32_t)ended->updates) << shift);
     const uint32_t deviation_q24 = ended->deviation / ended->updates << shift;
     const uint32_t amplitude_q24 = fixed_magnitude(half_q24);
-    int32_t *last_q24 = &mean->half_q24[ended->phase];
+    int32_t *last_q24 = &mean->half_q24[ended->phase % HAL_PHASES_MAX];
     const bool slow = ended->updates >= parameters->settle_updates / SLOW_PARTS;
     const bool drifted = slow && (beyond_last(half_q24, *last_q24, tolerance_q24) ||
                                   deviation_q24 / 2 > amplitude_q24 + tolerance_q24 + tolerance_q24 / 4);

@@ -108,7 +108,7 @@ static int32_t factor_by_shaft_q30(drive_t *drive) {
 }
 
 /* Scale of the tables. After the corrections, which are in the integrals of the next sample. */
-static void follow_table_scale(drive_t *drive, const flux_sample_t *input,
+static void follow_table_scale(drive_t *drive, hal_t *hal, const flux_sample_t *input,
                                const int32_t correction_q29[HAL_PHASES_MAX]) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const flux_residual_t *residual = &drive->flux.residual;
@@ -141,13 +141,13 @@ static void follow_table_scale(drive_t *drive, const flux_sample_t *input,
     }
     const table_scale_factors_t factors =
         table_scale_factors(follows ? drive->table_scale.smooth_q30 : TABLE_SCALE_ONE_Q30, period_q40, &flux);
-    hal_critical_enter(drive->hal);
+    hal_critical_enter(hal);
     drive->control.table_scale = factors;
-    hal_critical_leave(drive->hal);
+    hal_critical_leave(hal);
 }
 
 /* Checks phases and encoder, and corrects the integrals. */
-COLD static uint32_t check_flux(drive_t *drive, const flux_sample_t *input) {
+COLD static uint32_t check_flux(drive_t *drive, hal_t *hal, const flux_sample_t *input) {
     const uint32_t failed = flux_monitor_step(&drive->control_parameters.flux_monitor, &drive->flux, input);
     if (drive->control_parameters.torque_law == TORQUE_LAW_PREDICTIVE) {
         follow_misalignment(drive);
@@ -156,14 +156,14 @@ COLD static uint32_t check_flux(drive_t *drive, const flux_sample_t *input) {
     flux_residual_follow(&drive->flux.residual, correction_q29);
     drive->conduction_ends = false;
     if (input->run) {
-        follow_table_scale(drive, input, correction_q29);
+        follow_table_scale(drive, hal, input, correction_q29);
     }
     for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
         int32_t *next_q29 = &drive->control.applied_flux.next_q29[phase];
-        hal_critical_enter(drive->hal);
+        hal_critical_enter(hal);
         const int32_t corrected_q29 = fixed_add(*next_q29, correction_q29[phase]);
         *next_q29 = no_current(input, phase) ? fixed_non_negative(corrected_q29) : corrected_q29;
-        hal_critical_leave(drive->hal);
+        hal_critical_leave(hal);
     }
     return failed;
 }
@@ -193,10 +193,10 @@ COLD static available_torque_t find_available_torque(const drive_t *drive, int32
 }
 
 /* Each current is one word: a control interrupt in between changes none while it is read. */
-COLD static void follow_heat(drive_t *drive, uint32_t time_us) {
+COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const temperature_t *temperature = &drive->temperature;
-    temperature_step(&parameters->temperature, &drive->temperature, drive->hal, machine_tables.phases, time_us);
+    temperature_step(&parameters->temperature, &drive->temperature, hal, machine_tables.phases, time_us);
     if (thermal_sample(&parameters->thermal, &drive->thermal, drive->control.measurement.current_q9, time_us)) {
         const int32_t thermal_q24 = thermal_torque_limit_q24(&parameters->thermal, &drive->thermal);
         const int32_t by_heat_q24 = fixed_min(thermal_q24, temperature->torque_limit_q24);
@@ -213,21 +213,27 @@ COLD static bool is_commanded(const drive_t *drive) {
            drive->comms.bus.run_inhibited;
 }
 
+/* False when one of both notes of the lost phase has changed. */
+COLD static bool is_lost_phase_intact(const drive_t *drive) {
+    const uint32_t number = drive->control.lost_phase;
+    return number <= machine_tables.phases && drive->degraded.lost == UINT32_C(1) << number >> 1;
+}
+
 /* A latch that has changed is not to be trusted: the drive is in fault from here on, and of a run that this has ended
  * nothing is left. */
-COLD static void test_itself(drive_t *drive, uint32_t time_us) {
+COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
     self_test_t *test = &drive->self_test;
     state_machine_t *state_machine = &drive->control.state_machine;
-    self_test_step(test, drive->hal, &drive->control_parameters, &drive->parameters, time_us);
-    hal_critical_enter(drive->hal);
-    if (!self_test_latch_intact(&drive->control) || !is_commanded(drive)) {
+    self_test_step(test, hal, &drive->control_parameters, &drive->parameters, time_us);
+    hal_critical_enter(hal);
+    if (!self_test_latch_intact(&drive->control) || !is_commanded(drive) || !is_lost_phase_intact(drive)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
         drive->control.torque_reference_q24 = 0;
         control_prepare(&drive->control_parameters, &drive->control);
         state_machine_start_in_fault(state_machine, FAULT_BIT(FAULT_MEMORY));
         state_machine->record.time_us = time_us;
     }
-    hal_critical_leave(drive->hal);
+    hal_critical_leave(hal);
 }
 
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
@@ -250,7 +256,7 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
 }
 
 /* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
-COLD static void check(drive_t *drive, uint32_t time_us) {
+COLD static void check(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
     sample_t sample = {.flux = {.lost_phases = drive->degraded.lost,
                                 .periods_per_ms = parameters->initialise_ticks,
@@ -260,7 +266,7 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
     if (!read_sample(&drive->control, parameters, &sample)) {
         return;
     }
-    uint32_t failed = follow_lost_phase(drive, check_flux(drive, &sample.flux));
+    uint32_t failed = follow_lost_phase(drive, check_flux(drive, hal, &sample.flux));
     if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
     }
@@ -273,13 +279,13 @@ COLD static void check(drive_t *drive, uint32_t time_us) {
     drive->failed_checks = failed;
 }
 
-COLD void background_checks(drive_t *drive, uint32_t time_us) {
-    follow_heat(drive, time_us);
-    test_itself(drive, time_us);
+COLD void background_checks(drive_t *drive, hal_t *hal, uint32_t time_us) {
+    follow_heat(drive, hal, time_us);
+    test_itself(drive, hal, time_us);
     const bool suspicious = drive->flux.suspicious || drive->conduction_ends;
     const uint32_t spacing = suspicious ? 1 : drive->control_parameters.initialise_ticks / CHECKS_PER_MS;
     if (unmasked_read_periods(&drive->control.deferred_request) - drive->flux.residual.sample.periods >= spacing) {
-        check(drive, time_us);
+        check(drive, hal, time_us);
     }
     uint32_t failed = drive->failed_checks | thermal_faults(&drive->thermal) | temperature_faults(&drive->temperature) |
                       self_test_faults(&drive->self_test);

@@ -8,6 +8,6 @@
 
 /* Follows currents, voltages, angle and heat, and reports the failed checks to the interrupts, which latch the first
  * one. [background] */
-void background_checks(drive_t *drive, uint32_t time_us);
+void background_checks(drive_t *drive, hal_t *hal, uint32_t time_us);
 
 #endif

@@ -25,13 +25,13 @@ static bool may_configure(const drive_t *drive) {
 
 /* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
  * parts, those that may then be changed, which are all that differ. */
-COLD static void configure(drive_t *drive) {
+COLD static void configure(drive_t *drive, hal_t *hal) {
     control_parameters_t control_parameters =
-        configure_control(&drive->parameters, &machine_tables, drive->control_rate_hz, hal_encoder_bits(drive->hal),
-                          hal_adc_bits(drive->hal), hal_pwm_clock_hz(drive->hal));
+        configure_control(&drive->parameters, &machine_tables, drive->parameters.control_rate_hz, hal_encoder_bits(hal),
+                          hal_adc_bits(hal), hal_pwm_clock_hz(hal));
     control_parameters.thermal = thermal_configure(drive->parameters.values);
     control_parameters.temperature = temperature_configure(drive->parameters.values);
-    hal_critical_enter(drive->hal);
+    hal_critical_enter(hal);
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
@@ -39,13 +39,13 @@ COLD static void configure(drive_t *drive) {
         configure_tune(&drive->control_parameters, &control_parameters, CONFIGURE_TUNE_SPEED);
         deferred_tune(&drive->control_parameters, &drive->control);
         for (unsigned part = CONFIGURE_TUNE_SPEED + 1; part < CONFIGURE_TUNE_PARTS; part++) {
-            hal_critical_leave(drive->hal);
-            hal_critical_enter(drive->hal);
+            hal_critical_leave(hal);
+            hal_critical_enter(hal);
             configure_tune(&drive->control_parameters, &control_parameters, part);
         }
     }
     drive->applied_revision = drive->parameters.revision;
-    hal_critical_leave(drive->hal);
+    hal_critical_leave(hal);
     self_test_configured(&drive->self_test, &drive->control_parameters);
 }
 
@@ -56,13 +56,12 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
         return false;
     }
     *drive = (drive_t){
-        .hal = hal,
-        .control_rate_hz = config->control_rate_hz,
         .processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz),
     };
     self_test_init(&drive->self_test, hal, hal_time_us(hal));
     temperature_init(&drive->temperature, hal_time_us(hal));
     parameters_init(&drive->parameters);
+    parameters_set_control_rate(&drive->parameters, config->control_rate_hz);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
     if (config->telemetry_period_ms != 0) {
         parameters_set(&drive->parameters, PARAMETER_TELEMETRY_PERIOD_MS, (int32_t)config->telemetry_period_ms);
@@ -70,13 +69,9 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     nvm_store_init(&drive->store, hal, &drive->parameters);
     comms_init(&drive->comms, config->node, hal_time_us(hal));
     drive->thermal.step_us = hal_time_us(hal) - THERMAL_STEP_US / 2u; /* halfway between two telemetry cycles */
-    drive->comms.store = &drive->store;
-    drive->comms.trace = &drive->trace;
-    drive->comms.self_test = &drive->self_test;
-    drive->comms.control_parameters = &drive->control_parameters;
     xcp_init(&drive->comms.xcp, drive, DRIVE_WORDS, &drive->sampler);
     table_scale_reset(&drive->table_scale);
-    configure(drive);
+    configure(drive, hal);
     control_reset(&drive->control_parameters, &drive->control);
     drive->control.reported_fault_mask = self_test_faults(&drive->self_test);
     if (drive->store.inhibited) {
@@ -103,39 +98,39 @@ static inline fault_trace_values_t trace_values(const drive_t *drive, const hal_
     };
 }
 
-void drive_control_interrupt(drive_t *drive) {
+void drive_control_interrupt(drive_t *drive, hal_t *hal) {
     hal_adc_sample_t adc;
     control_sample_t sample = {
         .adc = &adc,
-        .missed_interrupts = hal_interrupt_missed_triggers(drive->hal),
-        .time_us = hal_time_us(drive->hal),
+        .missed_interrupts = hal_interrupt_missed_triggers(hal),
+        .time_us = hal_time_us(hal),
     };
-    drive->break_causes = sample.break_causes = hal_pwm_break(drive->hal);
-    hal_encoder_read(drive->hal, &sample.encoder);
-    hal_adc_read(drive->hal, &adc);
+    drive->break_causes = sample.break_causes = hal_pwm_break(hal);
+    hal_encoder_read(hal, &sample.encoder);
+    hal_adc_read(hal, &adc);
     const bool run =
         control_step(&drive->control_parameters, &drive->control, &sample, &drive->command, &drive->compare);
     if (run) {
-        hal_pwm_write(drive->hal, &drive->compare);
+        hal_pwm_write(hal, &drive->compare);
         const fault_trace_values_t values = trace_values(drive, &adc);
         fault_trace_run(&drive->trace, &values);
     } else {
         const fault_trace_values_t values = trace_values(drive, &adc);
-        hal_pwm_open_all(drive->hal);
+        hal_pwm_open_all(hal);
         if (sample.break_causes != 0) {
-            hal_pwm_clear_break(drive->hal);
+            hal_pwm_clear_break(hal);
         }
         if (!fault_trace_kept(&drive->trace)) {
             fault_trace_stand(&drive->trace, &values, drive->control.state_machine.state);
         }
     }
     if (drive->control.deferred_request.skipped == 0) {
-        hal_interrupt_request_deferred(drive->hal);
+        hal_interrupt_request_deferred(hal);
     }
     if (drive->sampler.event == SAMPLER_EVENT_CONTROL) {
         sampler_record(&drive->sampler, drive, DRIVE_WORDS, sample.time_us);
     }
-    drive->used_ticks = hal_interrupt_elapsed_ticks(drive->hal);
+    drive->used_ticks = hal_interrupt_elapsed_ticks(hal);
     if (drive->used_ticks > drive->worst_ticks) {
         drive->worst_ticks = drive->used_ticks;
     }
@@ -143,27 +138,27 @@ void drive_control_interrupt(drive_t *drive) {
 
 /* Ticks from the trigger of the control interrupt that requested the pending deferred step. The control interrupt may
  * pre-empt this function: then the next one is a whole period away from the second attempt. */
-static uint32_t deferred_elapsed_ticks(const drive_t *drive) {
+static uint32_t deferred_elapsed_ticks(const drive_t *drive, const hal_t *hal) {
     const volatile uint32_t *skipped = &drive->control.deferred_request.skipped;
     uint32_t periods = *skipped;
-    uint32_t elapsed = hal_interrupt_elapsed_ticks(drive->hal);
+    uint32_t elapsed = hal_interrupt_elapsed_ticks(hal);
     if (*skipped != periods) {
         periods = *skipped;
-        elapsed = hal_interrupt_elapsed_ticks(drive->hal);
+        elapsed = hal_interrupt_elapsed_ticks(hal);
     }
     return elapsed + periods * 2u * drive->control_parameters.period_ticks;
 }
 
-void drive_deferred_interrupt(drive_t *drive) {
+void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
     control_state_t *control = &drive->control;
     if (!deferred_pending(&control->deferred_request, &control->deferred.response)) {
         return;
     }
     deferred_compute(&drive->control_parameters, control, &drive->command);
     if (drive->sampler.event == SAMPLER_EVENT_DEFERRED) {
-        sampler_record(&drive->sampler, drive, DRIVE_WORDS, hal_time_us(drive->hal));
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, hal_time_us(hal));
     }
-    drive->deferred_used_ticks = deferred_elapsed_ticks(drive);
+    drive->deferred_used_ticks = deferred_elapsed_ticks(drive, hal);
     if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
         drive->deferred_worst_ticks = drive->deferred_used_ticks;
     }
@@ -172,38 +167,38 @@ void drive_deferred_interrupt(drive_t *drive) {
 
 /* Withdraws a command to run that must not start a run later: without being armed. Silence disarms, so that none
  * becomes so old that the clock wraps and its age appears small again. */
-static void drop_unarmed_command(drive_t *drive) {
+static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
     if (drive->command.request == COMMAND_RUN && !drive->comms.commands.arming.armed &&
         drive->control.state_machine.state != DRIVE_STATE_RUN) {
-        hal_critical_enter(drive->hal);
+        hal_critical_enter(hal);
         drive->command.request = COMMAND_OFF;
-        hal_critical_leave(drive->hal);
+        hal_critical_leave(hal);
     }
 }
 
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
  * timeout, and a sender that simply continues does not start the drive again. */
-COLD static void take_command(drive_t *drive) {
+COLD static void take_command(drive_t *drive, hal_t *hal) {
     const command_t *command = &drive->comms.command;
     bus_monitor_t *bus = &drive->comms.bus;
     /* The request as it was sent: bus-off disarms, and a request to run is published as off. */
     bus->run_inhibited = bus->run_inhibited && drive->comms.commands.requested.request == COMMAND_RUN;
     if (!bus->run_inhibited) {
-        hal_critical_enter(drive->hal);
+        hal_critical_enter(hal);
         drive->command = *command;
-        hal_critical_leave(drive->hal);
+        hal_critical_leave(hal);
         drive->ramping = false;
     }
 }
 
 /* Log of faults and storing of parameters. No operation of the memory in RUN, nor when the next control interrupt may
  * enter it: a command to run has been handed over. */
-static void keep_memory(drive_t *drive, uint32_t time_us) {
+static void keep_memory(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const drive_state_t state = drive->control.state_machine.state;
     if (state == DRIVE_STATE_FAULT) {
-        hal_critical_enter(drive->hal);
+        hal_critical_enter(hal);
         fault_record_t record = drive->control.state_machine.record;
-        hal_critical_leave(drive->hal);
+        hal_critical_leave(hal);
         record.self_test = telemetry_self_test(drive);
         record.sensors = telemetry_sensors_e_f(drive);
         record.phases = (uint8_t)drive->flux.phases;
@@ -212,7 +207,7 @@ static void keep_memory(drive_t *drive, uint32_t time_us) {
         nvm_store_follow_fault(&drive->store, NULL);
     }
     const bool writable = state == DRIVE_STATE_FAULT || may_configure(drive);
-    nvm_store_step(&drive->store, drive->hal, &drive->parameters, time_us, writable);
+    nvm_store_step(&drive->store, hal, &drive->parameters, time_us, writable);
 }
 
 /* The torque would carry the speed on, beyond the last reference. */
@@ -226,7 +221,7 @@ COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
 
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
  * with the time of the last valid command, so that the interrupts need nothing for it. */
-static void ramp_down(drive_t *drive, uint32_t time_us) {
+static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const uint32_t timeout_us = (uint32_t)drive->parameters.values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u;
     const uint32_t age_us = time_us - drive->command.time_us;
     if (drive->control.state_machine.state != DRIVE_STATE_RUN || age_us <= timeout_us ||
@@ -243,47 +238,47 @@ static void ramp_down(drive_t *drive, uint32_t time_us) {
     const uint32_t rest_us = elapsed_us < DRIVE_RAMP_US ? DRIVE_RAMP_US - elapsed_us : 0;
     const int64_t torque_q39 = (int64_t)drive->ramp_from_q24 * (int32_t)((rest_us << 15) / DRIVE_RAMP_US);
     const int32_t torque_q24 = (int32_t)fixed_shift(torque_q39, 15);
-    hal_critical_enter(drive->hal);
+    hal_critical_enter(hal);
     if (drive->control.state_machine.state == DRIVE_STATE_RUN) { /* it leaves RUN in an interrupt, never enters it */
         drive->command.request = COMMAND_RUN;
         drive->command.mode = DRIVE_MODE_TORQUE;
         drive->command.torque_reference_q24 = runs_away(drive, torque_q24) ? 0 : torque_q24;
     }
-    hal_critical_leave(drive->hal);
+    hal_critical_leave(hal);
 }
 
 /* Two words of each interrupt: one that comes in between advances what is read after it, by one step. */
-COLD static void kick_watchdog(drive_t *drive, uint32_t time_us) {
+COLD static void kick_watchdog(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const deferred_request_t *request = &drive->control.deferred_request;
     const volatile uint32_t *completed = &drive->control.deferred.response.completed;
     const uint32_t completed_before = *completed;
     if (watchdog_monitor_kick(&drive->watchdog, unmasked_read_periods(request), request->requests, completed_before,
                               time_us)) {
-        hal_watchdog_kick(drive->hal);
+        hal_watchdog_kick(hal);
     }
 }
 
 /* Values of one control period. Interrupts are masked only when they leave the background less time than this takes. */
-COLD static void collect_telemetry(drive_t *drive, uint32_t time_us, drive_telemetry_t *values) {
+COLD static void collect_telemetry(drive_t *drive, hal_t *hal, uint32_t time_us, drive_telemetry_t *values) {
     const deferred_request_t *request = &drive->control.deferred_request;
     for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
         const uint32_t periods = unmasked_read_begin(request);
-        telemetry_collect(drive, time_us, values);
+        telemetry_collect(drive, hal, time_us, values);
         if (unmasked_read_ended(request, periods)) {
             return;
         }
     }
-    hal_critical_enter(drive->hal);
-    telemetry_collect(drive, time_us, values);
-    hal_critical_leave(drive->hal);
+    hal_critical_enter(hal);
+    telemetry_collect(drive, hal, time_us, values);
+    hal_critical_leave(hal);
 }
 
 /* Telemetry that is due. */
-COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
+COLD NOINLINE static void send_telemetry(drive_t *drive, hal_t *hal, uint32_t time_us) {
     if (!comms_telemetry_due(&drive->comms, time_us)) {
         return;
     }
-    bus_monitor_step(&drive->comms.bus, drive->hal, time_us);
+    bus_monitor_step(&drive->comms.bus, hal, time_us);
     if (drive->comms.bus.run_inhibited) {
         commands_disarm(&drive->comms.commands);
     }
@@ -291,34 +286,39 @@ COLD NOINLINE static void send_telemetry(drive_t *drive, uint32_t time_us) {
         arming_end_configuration(&drive->comms.commands.arming);
     }
     drive_telemetry_t values;
-    collect_telemetry(drive, time_us, &values);
-    comms_telemetry(&drive->comms, drive->hal, &values);
+    collect_telemetry(drive, hal, time_us, &values);
+    comms_telemetry(&drive->comms, hal, &values);
 }
 
-COLD void drive_background(drive_t *drive) {
-    const uint32_t time_us = hal_time_us(drive->hal);
-    background_checks(drive, time_us);
+COLD void drive_background(drive_t *drive, hal_t *hal) {
+    const uint32_t time_us = hal_time_us(hal);
+    background_checks(drive, hal, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_CHECKED);
-    keep_memory(drive, time_us);
+    keep_memory(drive, hal, time_us);
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_STORED);
-    send_telemetry(drive, time_us);
-    const parameters_conditions_t conditions = {
-        .running = !may_configure(drive),
-        .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6,
+    send_telemetry(drive, hal, time_us);
+    const comms_objects_t objects = {
+        .parameters = &drive->parameters,
+        .conditions = {.running = !may_configure(drive),
+                       .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6},
+        .store = &drive->store,
+        .trace = &drive->trace,
+        .self_test = &drive->self_test,
+        .control_parameters = &drive->control_parameters,
     };
-    const bool commanded = comms_background(&drive->comms, drive->hal, &drive->parameters, &conditions,
-                                            drive->control.state_machine.state, time_us);
+    xcp_attach(&drive->comms.xcp, drive, DRIVE_WORDS, &drive->sampler);
+    const bool commanded = comms_background(&drive->comms, hal, &objects, drive->control.state_machine.state, time_us);
     if (drive->parameters.revision != drive->applied_revision) {
-        configure(drive); /* before a command that was received after the parameters */
+        configure(drive, hal); /* before a command that was received after the parameters */
     }
     if (commanded) {
-        take_command(drive);
+        take_command(drive, hal);
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     if (drive->sampler.event == SAMPLER_EVENT_BACKGROUND) {
         sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
     }
-    ramp_down(drive, time_us);
-    drop_unarmed_command(drive);
-    kick_watchdog(drive, time_us);
+    ramp_down(drive, hal, time_us);
+    drop_unarmed_command(drive, hal);
+    kick_watchdog(drive, hal, time_us);
 }

@@ -36,7 +36,6 @@
 
 /* One drive. The caller allocates it; only the functions below and telemetry_collect() access it. */
 typedef struct {
-    hal_t *hal;
     /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
     control_parameters_t control_parameters;
@@ -53,7 +52,6 @@ typedef struct {
     uint32_t deferred_worst_ticks; /* maximum since start */
     /* Used by the background only. */
     uint32_t processor_time_q24; /* LSB of telemetry, 5 ns, per tick */
-    uint32_t control_rate_hz;
     parameters_t parameters;
     uint32_t applied_revision; /* parameters.revision from which control_parameters are derived */
     uint32_t failed_checks;    /* of phases, encoder, stall and STO lines, when last checked, FAULT_BITs */
@@ -88,17 +86,17 @@ static_assert(sizeof(drive_t) % sizeof(uint32_t) == 0, "the sampler and XCP read
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a node number above NODE_MAX and
  * for a control rate that the timer's clock (hal_pwm.h) cannot make or that is too low for the machine
- * (machine_tables.h). hal must outlive the drive.
+ * (machine_tables.h). The drive keeps no pointer: each call is given the same hal.
  * [background, before anything else] */
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
 
 /* One control period. [control interrupt] */
-void drive_control_interrupt(drive_t *drive);
+void drive_control_interrupt(drive_t *drive, hal_t *hal);
 
 /* The deferred step that the control interrupt has requested (interrupts/deferred.h). [deferred interrupt] */
-void drive_deferred_interrupt(drive_t *drive);
+void drive_deferred_interrupt(drive_t *drive, hal_t *hal);
 
 /* Commands, telemetry, parameters; returns immediately when nothing is due. [background] */
-void drive_background(drive_t *drive);
+void drive_background(drive_t *drive, hal_t *hal);
 
 #endif

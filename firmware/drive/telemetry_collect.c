@@ -89,14 +89,14 @@ static void collect_degraded(const drive_t *drive, drive_telemetry_t *telemetry)
 
 /* Ts R in ohm s, Q-9.40, times the rate: R in Q7.24. */
 static void collect_estimates(const drive_t *drive, drive_telemetry_t *telemetry) {
-    const int64_t error_q40 = (int64_t)drive->table_scale.resistance_q40 * drive->control_rate_hz;
+    const int64_t error_q40 = (int64_t)drive->table_scale.resistance_q40 * drive->parameters.control_rate_hz;
     const int32_t resistance_q16 =
         fixed_saturate(fixed_shift(drive->parameters.values[PARAMETER_RESISTANCE_OHM] + (error_q40 >> 16), 8));
     telemetry->estimates.table_scale = (uint32_t)((1 << 15) + fixed_shift(drive->control.table_scale.excess_q31, 16));
     telemetry->estimates.resistance_ohm = (uint32_t)fixed_non_negative(resistance_q16);
 }
 
-void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry) {
+void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
     const control_measurement_t *measured = &control->measurement;
@@ -140,7 +140,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->adaptation.misalignment_deg = units_deviation_q20(misalignment(drive));
     telemetry->adaptation.torque_missing_nm = salient ? units_torque_q8(control->predictive.torque_shortfall_q24) : 0;
     telemetry->adaptation.observer_bandwidth_rad_s =
-        parameters->bandwidth.stage[control->bandwidth.stage].bandwidth_rad_s;
+        observer_bandwidth_stage(&parameters->bandwidth, control->bandwidth.stage)->bandwidth_rad_s;
 
     telemetry->fault_cause.time_us = record->time_us;
     telemetry->fault_cause.fault = record->fault;
@@ -168,7 +168,7 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->arming.run_unarmed = counters->run_unarmed;
 
     telemetry->bus_counters.unknown_frame = counters->unknown_frame;
-    telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(drive->hal);
+    telemetry->bus_counters.receive_overflow = hal_can_receive_overflows(hal);
     telemetry->bus_counters.command_accepted = counters->accepted;
 
     telemetry->bus_state.bus_state = bus->status.state;
@@ -220,5 +220,5 @@ void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t
     telemetry->heartbeat.fault = record->fault;
     telemetry->heartbeat.controller = parameters->controller;
     telemetry->heartbeat.phases = machine_tables.phases;
-    telemetry->heartbeat.control_rate_hz = drive->control_rate_hz;
+    telemetry->heartbeat.control_rate_hz = drive->parameters.control_rate_hz;
 }

@@ -9,7 +9,7 @@
 
 /* All signals of the drive's cyclic messages at one moment, in the LSBs of the bus (comms/units.h), except
  * telemetry_dropped, which telemetry_cycle() writes. The control interrupt must not run meanwhile. [background] */
-void telemetry_collect(const drive_t *drive, uint32_t time_us, drive_telemetry_t *telemetry);
+void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us, drive_telemetry_t *telemetry);
 
 /* Bits of DRIVE_SELF_TEST: failed temperature sensors, and above them SELF_TEST_*. */
 uint16_t telemetry_self_test(const drive_t *drive);

@@ -130,7 +130,7 @@ static int32_t disturbance_q24(const deferred_t *deferred, const deferred_input_
 /* Between slow counts the flux linkage is compared at an angle of the model, and no ripple corrects what the shape of
  * the tables errs by (misalignment.h): only what exceeds both is told. */
 static int32_t told_by_flux(const control_parameters_t *parameters, const deferred_t *deferred, int32_t misalignment) {
-    const int32_t offset = deferred->misalignment.phase[deferred->misalignment.phase_index].offset;
+    const int32_t offset = deferred->misalignment.phase[misalignment_phase_index(&deferred->misalignment)].offset;
     const uint32_t angle = slow_counts_uncertain_angle(&parameters->slow_counts, &deferred->slow_counts);
     const int32_t uncertain = (int32_t)((angle + MISALIGNMENT_SHAPE_ANGLE) * parameters->commutation.rotor_poles);
     const int32_t excused = fixed_clamp(fixed_subtract(misalignment, offset), -uncertain, uncertain);
@@ -142,7 +142,7 @@ NOINLINE static void learn_between_counts(const control_parameters_t *parameters
                                           const deferred_input_t *input,
                                           const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     const commutation_t commutation = {.electrical = input->electrical};
-    const unsigned phase = deferred->misalignment.phase_index;
+    const unsigned phase = misalignment_phase_index(&deferred->misalignment);
     const uint32_t angle = commutation_angle(&parameters->commutation, &commutation, phase) -
                            (uint32_t)deferred->misalignment.phase[phase].offset;
     /* The laws that learn no misalignment have none. */
@@ -158,7 +158,7 @@ NOINLINE static void learn_between_counts(const control_parameters_t *parameters
 static void learn_misalignment(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
     const commutation_t commutation = {.electrical = input->electrical};
-    const unsigned phase = deferred->misalignment.phase_index;
+    const unsigned phase = misalignment_phase_index(&deferred->misalignment);
     const uint32_t lag =
         (uint32_t)rotation(parameters, input) * parameters->commutation.rotor_poles * SLOPE_LAG_PERIODS;
     const misalignment_sample_t sample = {
@@ -167,7 +167,7 @@ static void learn_misalignment(const control_parameters_t *parameters, deferred_
                  (uint32_t)deferred->misalignment.phase[phase].offset - lag,
         .disturbance_q24 = disturbance_q24(deferred, input),
         .torque_q24 = input->torque_reference_q24,
-        .bandwidth_rad_s = parameters->bandwidth.stage[input->bandwidth.stage].bandwidth_rad_s,
+        .bandwidth_rad_s = observer_bandwidth_stage(&parameters->bandwidth, input->bandwidth.stage)->bandwidth_rad_s,
         .condition = condition(deferred, undisturbed_speed_control(parameters, deferred, input)),
         .flux_misalignment = flux_misalignment[phase],
     };

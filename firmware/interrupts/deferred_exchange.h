@@ -102,7 +102,7 @@ typedef struct {
 
 typedef struct {
     uint32_t completed; /* deferred steps, modulo 2^32 */
-    uint32_t latest;    /* index of the results in effect */
+    uint32_t latest;    /* index of the results in effect, by its lowest bit */
     deferred_results_t results[2];
 } deferred_response_t;
 
@@ -113,7 +113,7 @@ static inline bool deferred_pending(const deferred_request_t *request, const def
 /* Results in effect. [control interrupt, or background in a critical section] */
 static inline const deferred_results_t *deferred_results(const deferred_request_t *request,
                                                          const deferred_response_t *response) {
-    const deferred_results_t *results = &response->results[response->latest];
+    const deferred_results_t *results = &response->results[response->latest & 1u];
     IN_REGISTER(results);
     return results->generation == request->generation ? results : &request->initial;
 }
@@ -132,7 +132,7 @@ static inline void deferred_skip(deferred_request_t *request) {
 
 /* Buffer for the results of the pending step. [deferred interrupt] */
 static inline deferred_results_t *deferred_buffer(deferred_response_t *response) {
-    return &response->results[response->latest ^ 1u];
+    return &response->results[~response->latest & 1u];
 }
 
 /* Puts the buffer into effect and ends the step. The order of the stores matters. [deferred interrupt] */

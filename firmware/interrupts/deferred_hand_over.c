@@ -89,7 +89,8 @@ void deferred_hand_over(const control_parameters_t *parameters, control_state_t 
     input->run = run;
     input->torque_reference_q24 = state->torque_reference_q24;
     input->electrical = measured->commutation.electrical;
-    input->current_q9 = measured->current_q9[state->deferred.misalignment.phase_index]; /* no step is pending */
+    input->current_q9 =
+        measured->current_q9[misalignment_phase_index(&state->deferred.misalignment)]; /* no step is pending */
     if (parameters->bandwidth.schedule.adaptive) {
         hand_over_bandwidth(state, input);
     }

@@ -41,7 +41,6 @@
 #define SELF_TEST_LIMIT_WORDS (sizeof(protection_parameters_t) / sizeof(uint32_t))
 
 typedef struct {
-    hal_memory_t memory;
     uint32_t failed; /* SELF_TEST_* */
     uint32_t limit_complement[SELF_TEST_LIMIT_WORDS];
     uint32_t constants_sum;
@@ -60,7 +59,8 @@ void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us);
 /* Takes the copies of new constants. [background] */
 void self_test_configured(self_test_t *test, const control_parameters_t *parameters);
 
-/* False when number, mask and state of the latched fault contradict each other, or a state other than run the duties.
+/* False when number, mask and state of the latched fault contradict each other, a state other than run the duties, or
+ * when the state is none.
  * [background, in a critical section] */
 bool self_test_latch_intact(const control_state_t *control);
 

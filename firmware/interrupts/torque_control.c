@@ -115,9 +115,9 @@ void torque_control(const control_parameters_t *parameters, control_state_t *sta
     if (parameters->torque_law == TORQUE_LAW_HYSTERESIS || !duty_control(parameters, state, deferred)) {
         hysteresis_control(parameters, state, deferred);
     }
-    const uint32_t lost = state->lost_phase;
-    if (!LIKELY(lost == 0)) { /* the laws of hysteresis and duty know of no lost phase */
-        state->duty_q15[lost - 1u] = -MODULATOR_DUTY_ONE_Q15;
+    const uint32_t lost = state->lost_phase - 1u; /* UINT32_MAX: none */
+    if (!LIKELY(lost >= machine_tables.phases)) { /* the laws of hysteresis and duty know of no lost phase */
+        state->duty_q15[lost] = -MODULATOR_DUTY_ONE_Q15;
     }
 }
 

@@ -32,7 +32,7 @@ COLD int32_t degraded_torque_q24(const degraded_parameters_t *parameters, const 
 }
 
 COLD void degraded_step(const degraded_parameters_t *parameters, degraded_t *degraded, const machine_tables_t *tables) {
-    if (degraded->lost == 0 || degraded->angle == DEGRADED_ANGLES) {
+    if (degraded->lost == 0 || degraded->angle >= DEGRADED_ANGLES) {
         return;
     }
     const uint32_t electrical = degraded->angle * (UINT32_MAX / DEGRADED_ANGLES + 1u);
@@ -47,5 +47,5 @@ COLD void degraded_step(const degraded_parameters_t *parameters, degraded_t *deg
 }
 
 int32_t degraded_torque_limit_q24(const degraded_t *degraded) {
-    return degraded->lost != 0 && degraded->angle == DEGRADED_ANGLES ? degraded->most_q24 : INT32_MAX;
+    return degraded->lost != 0 && degraded->angle >= DEGRADED_ANGLES ? degraded->most_q24 : INT32_MAX;
 }

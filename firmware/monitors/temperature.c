@@ -67,7 +67,8 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
         temperature->hot[part] = temperature->hot[part] ? room < DERATE_CODES : room <= 0;
         least_room = fixed_min(room, least_room);
     }
-    const int64_t part_of_max = (int64_t)parameters->torque_max_q24 * fixed_non_negative(least_room);
+    const int64_t part_of_max =
+        (int64_t)fixed_non_negative(parameters->torque_max_q24) * fixed_non_negative(least_room);
     temperature->torque_limit_q24 = (int32_t)fixed_divide(part_of_max, DERATE_CODES);
 }
 

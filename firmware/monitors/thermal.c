@@ -84,7 +84,7 @@ COLD int32_t thermal_torque_limit_q24(const thermal_parameters_t *parameters, co
     const int32_t load_q16 = (int32_t)fixed_max_u32(winding_q16, switch_q16);
     const int32_t range_q16 = THERMAL_LIMIT_Q16 - THERMAL_DERATE_Q16;
     const int32_t room_q16 = fixed_clamp(THERMAL_LIMIT_Q16 - load_q16, 0, range_q16);
-    return (int32_t)fixed_divide((int64_t)parameters->torque_max_q24 * room_q16, range_q16);
+    return (int32_t)fixed_divide((int64_t)fixed_non_negative(parameters->torque_max_q24) * room_q16, range_q16);
 }
 
 COLD uint32_t thermal_faults(const thermal_t *thermal) {

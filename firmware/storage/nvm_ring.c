@@ -7,8 +7,9 @@
 #define LAYOUT_VERSION UINT32_C(1)
 #define COMMIT UINT64_C(0x0F1E2D3C4B5A6978)
 
+/* 0 when the length has changed in memory to 0. */
 static unsigned slots(const nvm_ring_t *ring) {
-    return HAL_NVM_PAGE_WORDS / ring->record_words;
+    return ring->record_words > 0 ? HAL_NVM_PAGE_WORDS / ring->record_words : 0;
 }
 
 static uint64_t read_word(const nvm_ring_t *ring, const hal_t *hal, unsigned page, unsigned slot, unsigned word) {
@@ -47,6 +48,11 @@ static bool erased(const nvm_ring_t *ring, const hal_t *hal, unsigned page, unsi
     return true;
 }
 
+/* False for a place outside of both pages, which has changed in memory. */
+static bool is_inside(const nvm_ring_t *ring) {
+    return ring->page < 2 && ring->newest_page < 2 && ring->slot < slots(ring) && ring->word < ring->record_words;
+}
+
 /* The first erased place from the present one on, else the start of the page that does not have the newest record: of
  * the present page again, when every place of it was passed over before a record was committed. Without a record page 0
  * is kept, because what is damaged there tells the caller that there was one. */
@@ -56,7 +62,7 @@ static void find_place(nvm_ring_t *ring, const hal_t *hal) {
     while (ring->slot < slots(ring) && !erased(ring, hal, ring->page, ring->slot)) {
         ring->slot++;
     }
-    if (ring->slot == slots(ring)) {
+    if (ring->slot >= slots(ring)) {
         ring->page = ring->newest_page ^ 1u;
         ring->slot = 0;
         ring->erase = true;
@@ -109,6 +115,9 @@ static nvm_ring_result_t pass_over(nvm_ring_t *ring, const hal_t *hal) {
 }
 
 COLD nvm_ring_result_t nvm_ring_step(nvm_ring_t *ring, hal_t *hal, uint64_t payload_word) {
+    if (!is_inside(ring)) {
+        return NVM_RING_FAILED;
+    }
     if (ring->erase) {
         ring->erase = false;
         return hal_nvm_erase(hal, (unsigned)ring->first_page + ring->page) ? NVM_RING_BUSY : pass_over(ring, hal);

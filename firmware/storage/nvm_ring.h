@@ -61,7 +61,8 @@ static inline unsigned nvm_ring_payload_index(const nvm_ring_t *ring) {
     return ring->word - 1u;
 }
 
-/* Next operation of writing a record: repeated until the result is not NVM_RING_BUSY. */
+/* Next operation of writing a record: repeated until the result is not NVM_RING_BUSY. A place that has changed in
+ * memory to one outside of both pages is not written to: the record fails. */
 nvm_ring_result_t nvm_ring_step(nvm_ring_t *ring, hal_t *hal, uint64_t payload_word);
 
 /* Leaves the record that is being written unfinished: the next step begins another one. */

@@ -77,7 +77,7 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
     }
     store->fault_seen = true;
     store->fault_time_us = record->time_us;
-    if (store->waiting_count == NVM_STORE_WAITING_MAX) {
+    if (store->waiting_count >= NVM_STORE_WAITING_MAX) {
         return;
     }
     /* The clock may have wrapped since the last step. */

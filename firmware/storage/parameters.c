@@ -46,7 +46,8 @@ COLD uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]) {
 
 /* Another one than 0 for memory that has been cleared. */
 static uint32_t sum_of(const parameters_t *parameters) {
-    return ~(parameters_sum(parameters->values) + (uint32_t)parameters->controller_default);
+    return ~(parameters_sum(parameters->values) + (uint32_t)parameters->controller_default +
+             parameters->control_rate_hz);
 }
 
 bool parameters_intact(const parameters_t *parameters) {
@@ -58,6 +59,7 @@ void parameters_init(parameters_t *parameters) {
         parameters->values[i] = machine_tables.parameter_default[i];
     }
     parameters->controller_default = machine_tables.parameter_default[PARAMETER_CONTROLLER];
+    parameters->control_rate_hz = 0;
     parameters->sum = sum_of(parameters);
     parameters->revision = 0;
 }
@@ -91,6 +93,11 @@ void parameters_set(parameters_t *parameters, unsigned index, int32_t value) {
 void parameters_set_controller(parameters_t *parameters, int32_t controller) {
     parameters_set(parameters, PARAMETER_CONTROLLER, controller);
     parameters->controller_default = parameters->values[PARAMETER_CONTROLLER];
+    parameters->sum = sum_of(parameters);
+}
+
+void parameters_set_control_rate(parameters_t *parameters, uint32_t control_rate_hz) {
+    parameters->control_rate_hz = control_rate_hz;
     parameters->sum = sum_of(parameters);
 }
 

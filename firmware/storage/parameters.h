@@ -30,8 +30,9 @@ typedef struct {
 typedef struct {
     int32_t values[PARAMETER_COUNT];
     int32_t controller_default;
-    uint32_t sum;      /* of both: parameters_intact() */
-    uint32_t revision; /* incremented by every change, so that derived values can be recomputed */
+    uint32_t control_rate_hz; /* of the board; no parameter, but as constant */
+    uint32_t sum;             /* of the three: parameters_intact() */
+    uint32_t revision;        /* incremented by every change, so that derived values can be recomputed */
 } parameters_t;
 
 /* Sets every value to the machine's default. */
@@ -52,6 +53,9 @@ void parameters_set(parameters_t *parameters, unsigned index, int32_t value);
 
 /* Sets the controller of this drive as default and present value, clamped to the row's limits. */
 void parameters_set_controller(parameters_t *parameters, int32_t controller);
+
+/* Sets the control rate of this drive's board, Hz. */
+void parameters_set_control_rate(parameters_t *parameters, uint32_t control_rate_hz);
 
 /* The default of this drive: that of the machine, but for the controller. index 0..PARAMETER_COUNT-1. */
 int32_t parameters_default(const parameters_t *parameters, unsigned index);

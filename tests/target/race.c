@@ -172,8 +172,8 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
 }
 
 /* Copies the words that the interrupt wrote. */
-void telemetry_collect(const drive_t *from, uint32_t time_us, drive_telemetry_t *telemetry) {
-    (void)time_us;
+void telemetry_collect(const drive_t *from, const hal_t *hal, uint32_t time_us, drive_telemetry_t *telemetry) {
+    (void)hal, (void)time_us;
     memcpy(telemetry, SNAPSHOT(&from->control), sizeof *telemetry);
 }
 
@@ -308,20 +308,24 @@ void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler
     (void)xcp, (void)memory, (void)words, (void)sampler;
 }
 
+void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {
+    (void)xcp, (void)memory, (void)words, (void)sampler;
+}
+
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     (void)comms, (void)hal;
     torn_snapshots += torn(values, sizeof *values);
 }
 
-bool comms_background(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
-                      drive_state_t state, uint32_t time_us) {
-    (void)conditions, (void)state;
+bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects, drive_state_t state,
+                      uint32_t time_us) {
+    (void)state;
     static uint16_t reported; /* interrupts */
     /* As a time just past: a command with it is neither stale nor overdue; as a request none to run. */
     const uint32_t number = (time_us - 0x100u) | 0x80u;
     fill(&comms->command, sizeof comms->command, number);
-    parameters->revision++;
-    parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] = 50;
+    objects->parameters->revision++;
+    objects->parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] = 50;
     hal_critical_enter(hal);
     const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
     const uint16_t deferred_counts[4] = {preemptions, torn_inputs, torn_results,
@@ -350,11 +354,11 @@ void hal_critical_leave(hal_t *hal) {
 #endif
 
 __attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &board);
 }
 
 __attribute__((used)) void program_deferred(void) { /* likewise */
-    drive_deferred_interrupt(&drive);
+    drive_deferred_interrupt(&drive, &board);
 }
 
 noreturn void program_start(void) {
@@ -368,7 +372,7 @@ noreturn void program_start(void) {
         if (board.mailbox.event == MAILBOX_INTERRUPT && !board.mailbox.timed) {
             board_interrupt_pend();
         } else {
-            drive_background(&drive);
+            drive_background(&drive, &board);
             delay(random_of(&sequence)); /* the interrupt occurs at all points of a round */
         }
         doorbell_ring(MAILBOX_NEXT);

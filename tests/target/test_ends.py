@@ -33,17 +33,17 @@ bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     return true;
 }
 
-void drive_control_interrupt(drive_t *drive) {
+void drive_control_interrupt(drive_t *drive, hal_t *hal) {
     static int calls;
     if (++calls == 10) {
         __builtin_trap();
     }
 }
 
-void drive_deferred_interrupt(drive_t *drive) {
+void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
 }
 
-void drive_background(drive_t *drive) {
+void drive_background(drive_t *drive, hal_t *hal) {
 }
 """
 """Replaces the firmware: traps in its tenth control interrupt."""

@@ -209,17 +209,17 @@ class Drive : public testing::Test {
         if (hal->deferred_requests > 0) {
             EXPECT_EQ(hal->deferred_requests, 1u);
             hal->deferred_requests = 0;
-            drive_deferred_interrupt(drive);
+            drive_deferred_interrupt(drive, hal);
         }
     }
 
     void periods(int count) {
         for (int k = 0; k < count; k++) {
             hal.time_us += 25;
-            drive_control_interrupt(&drive);
+            drive_control_interrupt(&drive, &hal);
             conduct();
             deferred_interrupt(&drive, &hal);
-            drive_background(&drive);
+            drive_background(&drive, &hal);
         }
     }
 
@@ -401,9 +401,9 @@ TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everythin
 TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
     const std::vector<std::function<void()>> without = {
         // Background, deferred interrupt, control interrupt.
-        [&] { drive_control_interrupt(&drive), deferred_interrupt(&drive, &hal); },
-        [&] { drive_control_interrupt(&drive), drive_background(&drive); },
-        [&] { drive_background(&drive); },
+        [&] { drive_control_interrupt(&drive, &hal), deferred_interrupt(&drive, &hal); },
+        [&] { drive_control_interrupt(&drive, &hal), drive_background(&drive, &hal); },
+        [&] { drive_background(&drive, &hal); },
     };
     for (const std::function<void()> &step : without) {
         hal = hal_t{};
@@ -457,9 +457,9 @@ TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
     other.command.request = COMMAND_CLEAR_FAULT;
     for (int i = 0; i < 2000; i++) {
         changed.time_us += 25;
-        drive_control_interrupt(&other);
-        drive_deferred_interrupt(&other);
-        drive_background(&other);
+        drive_control_interrupt(&other, &changed);
+        drive_deferred_interrupt(&other, &changed);
+        drive_background(&other, &changed);
     }
     EXPECT_EQ(other.control.state_machine.state, DRIVE_STATE_FAULT);
     EXPECT_TRUE(changed.open);
@@ -496,7 +496,7 @@ TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     periods(3);
     ASSERT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_ERROR);
     drive.control.state_machine.state = DRIVE_STATE_READY; // as by a flipped bit
-    drive_background(&drive);
+    drive_background(&drive, &hal);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
     periods(100);
@@ -532,9 +532,9 @@ TEST_F(Drive, of_a_run_that_a_changed_state_ends_the_next_background_leaves_neit
         drive_t ended = drive;
         ended.control.state_machine.state = changed; // as by a flipped bit
         ended.control.state_machine.rearmed = false;
-        drive_control_interrupt(&ended);
+        drive_control_interrupt(&ended, &hal);
         EXPECT_TRUE(hal.open) << changed;
-        drive_background(&ended);
+        drive_background(&ended, &hal);
         EXPECT_EQ(ended.control.state_machine.record.fault, FAULT_MEMORY) << changed;
         EXPECT_EQ(ended.control.torque_reference_q24, 0) << changed;
         for (const int32_t duty_q15 : ended.control.duty_q15) {
@@ -664,11 +664,11 @@ TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     while (hal.time_us - last_us <= 500000) {
         EXPECT_FALSE(hal.open);
         hal.time_us += 25;
-        drive_control_interrupt(&drive);
+        drive_control_interrupt(&drive, &hal);
         deferred_interrupt(&drive, &hal);
     }
     hal.time_us += 25;
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &hal);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
 }
@@ -928,15 +928,15 @@ TEST_F(Drive, does_not_start_on_a_timer_that_cannot_make_the_rate) {
 TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_period) {
     periods(100);
     hal.elapsed_ticks = 1500;
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &hal);
     EXPECT_EQ(hal.deferred_requests, 1u);
-    drive_control_interrupt(&drive); // before the deferred interrupt
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &hal); // before the deferred interrupt
+    drive_control_interrupt(&drive, &hal);
     EXPECT_EQ(hal.deferred_requests, 1u) << "none while one is pending";
     hal.elapsed_ticks = 2000;
     deferred_interrupt(&drive, &hal);
     EXPECT_EQ(drive.deferred_used_ticks, 2 * 5000 + 2000u);
-    drive_deferred_interrupt(&drive); // not requested
+    drive_deferred_interrupt(&drive, &hal); // not requested
     EXPECT_EQ(drive.deferred_used_ticks, 2 * 5000 + 2000u);
     hal.from_drive.clear();
     periods(4000 + 40);
@@ -956,9 +956,9 @@ TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
     for (int k = 0; k < 9; k++) {
         EXPECT_FALSE(hal.open) << k;
         hal.time_us += 25;
-        drive_control_interrupt(&drive);
+        drive_control_interrupt(&drive, &hal);
     }
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &hal);
     EXPECT_TRUE(hal.open);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
 }
@@ -1327,7 +1327,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
     control_parameters_t in_run{};
     hal.after_critical_section = [&] {
         hal.time_us += 25;
-        drive_control_interrupt(&drive);
+        drive_control_interrupt(&drive, &hal);
         conduct();
         deferred_interrupt(&drive, &hal);
         if (!ran && drive.control.state_machine.state == DRIVE_STATE_RUN) {
@@ -1336,7 +1336,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
         }
     };
     for (int call = 0; call < 10; call++) {
-        drive_background(&drive);
+        drive_background(&drive, &hal);
     }
     hal.after_critical_section = nullptr;
     periods(3);
@@ -1517,9 +1517,9 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     for (int k = 0; k < 50; k++) {
         periods(1);
         other_hal.time_us += 50;
-        drive_control_interrupt(&other);
+        drive_control_interrupt(&other, &other_hal);
         deferred_interrupt(&other, &other_hal);
-        drive_background(&other);
+        drive_background(&other, &other_hal);
     }
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
     EXPECT_EQ(other.control.state_machine.state, DRIVE_STATE_READY);
@@ -1676,7 +1676,7 @@ TEST_F(Drive, no_other_identifier_length_or_flag_is_an_identifier_conflict_or_ch
         }
         hal.to_drive.push_back(frame);
         if (hal.to_drive.size() == COMMS_FRAMES_PER_CALL) {
-            drive_background(&drive);
+            drive_background(&drive, &hal);
             ASSERT_TRUE(hal.to_drive.empty());
         }
     };

@@ -89,16 +89,31 @@ TEST(FullBusLoad, commands_pass_a_full_bus_of_a_higher_identifier_and_control_is
     config.stop.descriptors[0] = config.stop.descriptors[1] = -1;
     config.transport = &sender.transport;
     rig_init(rig.get(), &config);
-    hal_t hal{};
-    hal.board = &rig->board;
-    auto drive = std::make_unique<drive_t>();
+    struct Joined {
+        drive_t drive;
+        hal_t hal;
+    };
+    auto joined = std::make_unique<Joined>();
+    joined->hal.board = &rig->board;
+    const drive_t *drive = &joined->drive;
     const drive_config_t drive_config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
-    ASSERT_TRUE(drive_init(drive.get(), &hal, &drive_config));
-    const rig_firmware_t firmware = {
-        .control_interrupt = [](void *context) { drive_control_interrupt(static_cast<drive_t *>(context)); },
-        .deferred_interrupt = [](void *context) { drive_deferred_interrupt(static_cast<drive_t *>(context)); },
-        .background = [](void *context) { drive_background(static_cast<drive_t *>(context)); },
-        .context = drive.get()};
+    ASSERT_TRUE(drive_init(&joined->drive, &joined->hal, &drive_config));
+    const rig_firmware_t firmware = {.control_interrupt =
+                                         [](void *context) {
+                                             auto *board = static_cast<Joined *>(context);
+                                             drive_control_interrupt(&board->drive, &board->hal);
+                                         },
+                                     .deferred_interrupt =
+                                         [](void *context) {
+                                             auto *board = static_cast<Joined *>(context);
+                                             drive_deferred_interrupt(&board->drive, &board->hal);
+                                         },
+                                     .background =
+                                         [](void *context) {
+                                             auto *board = static_cast<Joined *>(context);
+                                             drive_background(&board->drive, &board->hal);
+                                         },
+                                     .context = joined.get()};
     rig_join(rig.get(), &firmware);
 
     const uint64_t settled_ns = 300 * MS;
@@ -117,7 +132,7 @@ TEST(FullBusLoad, commands_pass_a_full_bus_of_a_higher_identifier_and_control_is
         ASSERT_EQ(drive->control.state_machine.state, DRIVE_STATE_RUN);
         ASSERT_NEAR(rig->plant.speed_rad_s, 600 * 2 * M_PI / 60, 0.5);
         // The drive's counter saturates: it is followed and set back.
-        uint16_t &unknown = drive->comms.commands.counters.unknown_frame;
+        uint16_t &unknown = joined->drive.comms.commands.counters.unknown_frame;
         seen += unknown;
         unknown = 0;
     }

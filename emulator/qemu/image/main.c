@@ -13,11 +13,11 @@ extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], s
 static drive_t drive;
 
 __attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
-    drive_control_interrupt(&drive);
+    drive_control_interrupt(&drive, &board);
 }
 
 __attribute__((used)) void program_deferred(void) { /* likewise */
-    drive_deferred_interrupt(&drive);
+    drive_deferred_interrupt(&drive, &board);
 }
 
 static void flip(memory_object_t object, uint32_t bit) {
@@ -55,7 +55,7 @@ static noreturn void run(void) {
             board_interrupt_pend();
             break;
         case MAILBOX_BACKGROUND:
-            drive_background(&drive);
+            drive_background(&drive, &board);
             break;
         case MAILBOX_FLIP:
             flip((memory_object_t)mailbox->flip_object, mailbox->flip_bit);

@@ -93,10 +93,10 @@ constexpr uint32_t STEP_US = 25;
 class Comms : public testing::Test {
   protected:
     Comms() {
-        drive.hal = &bus;
-        drive.control_rate_hz = 40000;
+        drive.parameters.control_rate_hz = 40000;
         drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
+        objects.parameters = &parameters;
         parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 1);
         comms_init(&comms, 0, 0);
     }
@@ -105,7 +105,7 @@ class Comms : public testing::Test {
     void report(uint32_t at_us) {
         drive_telemetry_t values;
         bus_monitor_step(&comms.bus, &bus, at_us);
-        telemetry_collect(&drive, at_us, &values);
+        telemetry_collect(&drive, &bus, at_us, &values);
         comms_telemetry(&comms, &bus, &values);
     }
 
@@ -118,7 +118,7 @@ class Comms : public testing::Test {
             if (comms_telemetry_due(&comms, time_us)) {
                 report(time_us);
             }
-            if (comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, time_us)) {
+            if (comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, time_us)) {
                 accepted.push_back(comms.command);
             }
         }
@@ -144,7 +144,7 @@ class Comms : public testing::Test {
     drive_t drive{};
     comms_t &comms = drive.comms;
     parameters_t &parameters = drive.parameters;
-    parameters_conditions_t conditions{};
+    comms_objects_t objects{};
     uint32_t time_us = 0;
     uint32_t frame_us = 125; // a frame on the bus, rounded to steps
     std::vector<command_t> accepted;
@@ -321,7 +321,7 @@ TEST_F(Comms, loads_of_windings_and_switches_are_hundredths_of_a_percent_of_the_
         drive.thermal.winding_q56[2] = int64_t(load * 0x1p56);
         drive.thermal.switches_q56[1] = int64_t(load * 0x1p55);
         drive_telemetry_t values;
-        telemetry_collect(&drive, 0, &values);
+        telemetry_collect(&drive, &bus, 0, &values);
         EXPECT_EQ(values.thermal.winding_load, expected);
         EXPECT_EQ(values.thermal.switch_load, expected / 2);
     }
@@ -334,7 +334,7 @@ TEST_F(Comms, a_lost_phase_is_named_with_the_torque_that_is_left_and_without_one
         drive.degraded.mean_q24 = 6 << 24;
         drive.degraded.least_q24 = -(2 << 24);
         drive_telemetry_t values;
-        telemetry_collect(&drive, 0, &values);
+        telemetry_collect(&drive, &bus, 0, &values);
         const bool lost = phase < 4;
         EXPECT_EQ(values.degraded.degraded, lost);
         EXPECT_EQ(values.degraded.lost_phase_a, phase == 0);
@@ -344,7 +344,7 @@ TEST_F(Comms, a_lost_phase_is_named_with_the_torque_that_is_left_and_without_one
         EXPECT_EQ(values.degraded.torque_mean_nm, lost ? 6 * 256 : 0);
         EXPECT_EQ(values.degraded.torque_least_nm, lost ? -2 * 256 : 0);
         drive.degraded.mean_q24 = 0; // the sum is not complete
-        telemetry_collect(&drive, 0, &values);
+        telemetry_collect(&drive, &bus, 0, &values);
         EXPECT_EQ(values.degraded.torque_mean_nm, 0);
         EXPECT_EQ(values.degraded.torque_least_nm, 0);
     }
@@ -373,7 +373,7 @@ TEST_F(Comms, the_misalignment_is_the_mean_of_the_phases_that_the_machine_has) {
             drive.control.deferred.misalignment.phase[other].offset = other == phase ? part : 0;
         }
         drive_telemetry_t values;
-        telemetry_collect(&drive, 0, &values);
+        telemetry_collect(&drive, &bus, 0, &values);
         const double expected = phase < machine_tables.phases ? 4096.0 / machine_tables.phases : 0.0;
         EXPECT_NEAR(values.adaptation.misalignment_deg, expected, 0.51) << phase;
     }
@@ -570,7 +570,7 @@ TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
         if (comms_telemetry_due(&comms, start + elapsed)) {
             report(start + elapsed);
         }
-        comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, start + elapsed);
+        comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, start + elapsed);
     }
     EXPECT_EQ(bus.count(DRIVE_STATUS_FRAME_ID), 10u);
 }
@@ -589,7 +589,7 @@ TEST_F(Comms, every_command_is_seen_in_order) {
 
 TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
-    comms_background(&comms, &bus, &parameters, &conditions, DRIVE_STATE_READY, 0);
+    comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, 0);
     EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
     EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
 }

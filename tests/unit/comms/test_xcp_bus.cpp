@@ -108,13 +108,10 @@ hal_can_frame_t xcp_command(const std::vector<uint8_t> &bytes, unsigned node = 0
 struct World {
     explicit World(unsigned node = 0) : node(node) {
         std::memset(drive.get(), 0, sizeof *drive);
-        drive->hal = &bus;
-        drive->control_rate_hz = 40000;
         drive->control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&drive->parameters);
         parameters_set(&drive->parameters, PARAMETER_TELEMETRY_PERIOD_MS, 1);
         comms_init(&comms, node, 0);
-        comms.store = &drive->store;
         xcp_init(&comms.xcp, drive.get(), DRIVE_WORDS, &drive->sampler);
     }
 
@@ -134,7 +131,7 @@ struct World {
         }
         commands.push_back({0xE0, 0x10, 0, 0, 0, 0, 1, 0});
         commands.push_back({0xDE, 1, 0, 0});
-        const xcp_context_t context = {&drive->parameters, &conditions, &comms.set, comms.store};
+        const xcp_context_t context = {&drive->parameters, &conditions, &comms.set, &drive->store};
         for (const auto &bytes : commands) {
             const hal_can_frame_t frame = xcp_command(bytes);
             hal_can_frame_t response{};
@@ -151,10 +148,12 @@ struct World {
         if (comms_telemetry_due(&comms, time_us)) {
             bus_monitor_step(&comms.bus, &bus, time_us);
             drive_telemetry_t values;
-            telemetry_collect(drive.get(), time_us, &values);
+            telemetry_collect(drive.get(), &bus, time_us, &values);
             comms_telemetry(&comms, &bus, &values);
         }
-        comms_background(&comms, &bus, &drive->parameters, &conditions, DRIVE_STATE_READY, time_us);
+        const comms_objects_t objects = {&drive->parameters,  conditions, &drive->store, &drive->trace,
+                                         &drive->self_test, &drive->control_parameters};
+        comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, time_us);
         time_us += STEP_US;
     }
 
@@ -207,7 +206,7 @@ class XcpBus : public testing::TestWithParam<load_t> {
 
     static void connect(World &world) {
         const xcp_context_t context = {&world.drive->parameters, &world.conditions, &world.comms.set,
-                                       world.comms.store};
+                                       &world.drive->store};
         const hal_can_frame_t frame = xcp_command({0xFF, 0});
         hal_can_frame_t response{};
         ASSERT_TRUE(xcp_receive(&world.comms.xcp, &world.bus, &frame, &context, 0, &response));

@@ -102,7 +102,7 @@ class Control : public testing::Test {
         telemetry_drive.control_parameters = parameters;
         telemetry_drive.control = state;
         drive_telemetry_t telemetry;
-        telemetry_collect(&telemetry_drive, sample.time_us, &telemetry);
+        telemetry_collect(&telemetry_drive, nullptr, sample.time_us, &telemetry);
         diagnostics_t values = {
             .angle = state.measurement.angle,
             .speed_q22 = state.observer.speed_q22,
