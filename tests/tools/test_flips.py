@@ -10,6 +10,7 @@ import pytest
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import flips
+from salient.experiments.campaign import layout as layout_module
 from salient.experiments.campaign.layout import Layout
 from salient.experiments.campaign.runner import digest, program
 from salient.experiments.campaign.runner import flips as run_flips
@@ -51,6 +52,11 @@ def test_members_have_their_names_and_every_bit_has_one(layout: Layout) -> None:
     assert all(layout.member(bit) for bit in range(0, 8 * layout.size, 7))
     with pytest.raises(UsageError, match="control.no_such: drive_t has no member 'no_such' there"):
         layout.bits("control.no_such")
+
+
+def test_the_drive_stores_no_pointer(layout: Layout) -> None:
+    assert layout.pointers() == []
+    assert layout_module.pointers({"bytes": 8, "members": [(0, 64, "a", {"bytes": 8, "pointer": True})]}) == ["a"]
 
 
 def test_an_even_stride_is_refused(layout: Layout) -> None:

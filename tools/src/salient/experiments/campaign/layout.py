@@ -31,6 +31,10 @@ class Layout:
         "padding of" a structure where no member has it."""
         return _member(self._type, bit, "")
 
+    def pointers(self) -> list[str]:
+        """Names of the members that are pointers, without the indices of arrays."""
+        return pointers(self._type)
+
     def bits(self, path: str) -> range:
         """Bits of a member, by the names from the outermost one on, joined by points. UsageError: there is none."""
         of, first, length = self._type, 0, 8 * self.size
@@ -41,6 +45,16 @@ class Layout:
             begin, length, _, of = found[0]
             first += begin
         return range(first, first + length)
+
+
+def pointers(of: dict[str, Any], path: str = "") -> list[str]:
+    """Names of the pointers within a type, as Layout describes it."""
+    if "elements" in of:
+        return pointers(of["elements"][1], path)
+    found = [path] if of.get("pointer") else []
+    for _, _, name, inner in of.get("members", ()):
+        found += pointers(inner, f"{path}.{name}" if path and name else path or name)
+    return found
 
 
 def _find(dwarf: Any) -> Any:
@@ -73,7 +87,7 @@ def _described(entry: Any) -> dict[str, Any]:
             of = {"bytes": length * of["bytes"], "elements": (length, of)}
         return of
     if entry.tag not in ("DW_TAG_structure_type", "DW_TAG_union_type"):
-        return {"bytes": _number(entry, "DW_AT_byte_size")}
+        return {"bytes": _number(entry, "DW_AT_byte_size"), "pointer": entry.tag == "DW_TAG_pointer_type"}
     members = []
     for each in entry.iter_children():
         if each.tag != "DW_TAG_member":
