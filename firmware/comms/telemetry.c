@@ -129,7 +129,7 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     uint32_t cycles = 1;
     /* Negative when the values were collected a little before the cycle was due. */
     int32_t late_us = (int32_t)(values->status.time_us - telemetry->next_us);
-    if (late_us < 0) { /* changed in memory: telemetry_due() */
+    if (late_us < -TELEMETRY_CYCLE_US) { /* changed in memory: telemetry_due() */
         telemetry->next_us = values->status.time_us;
         late_us = 0;
     }

@@ -302,8 +302,9 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
     const period_t period = {(uint32_t)flux_step_max_q29 >> flux_shift, (sample->angle_step >> 8) + 1};
 
     plan_t plan[HAL_PHASES_MAX];
-    phase_cell_t *cells = control->cell[control->turn & 1u]; /* those of this sample have served */
-    control->turn++;
+    const unsigned turn = control->turn & 1u;
+    phase_cell_t *cells = control->cell[turn]; /* those of this sample have served */
+    control->turn = turn ^ 1u;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;
     UNROLL(4)

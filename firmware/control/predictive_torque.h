@@ -66,7 +66,7 @@ typedef struct {
     int32_t position_q13[HAL_PHASES_MAX]; /* of the planned operating point, in table columns, Q13; about 0..40 */
     int8_t column[HAL_PHASES_MAX];        /* table column in which the next plan begins, before it is limited */
     phase_cell_t cell[2][HAL_PHASES_MAX]; /* of the plans for this sample and for the next one, in turn */
-    unsigned turn;                        /* its lowest bit: index of those for this sample */
+    unsigned turn;                        /* index of those for this sample, by its lowest bit */
 } predictive_torque_t;
 
 typedef struct {

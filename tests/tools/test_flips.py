@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from salient.drive_layout import Layout, layout_file
+from salient.drive_layout import Layout, layout_file, pointers
 from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import flips
@@ -51,6 +51,11 @@ def test_members_have_their_names_and_every_bit_has_one(layout: Layout) -> None:
     assert all(layout.member(bit) for bit in range(0, 8 * layout.size, 7))
     with pytest.raises(UsageError, match="control.no_such: drive_t has no member 'no_such' there"):
         layout.bits("control.no_such")
+
+
+def test_the_drive_stores_no_pointer_but_two_that_each_pass_writes_before_it_uses_them(layout: Layout) -> None:
+    assert layout.pointers() == ["comms.xcp.memory", "comms.xcp.sampler"]  # xcp_attach()
+    assert pointers({"bytes": 8, "members": [(0, 64, "a", {"bytes": 8, "pointer": True})]}) == ["a"]
 
 
 def test_an_even_stride_is_refused(layout: Layout) -> None:

@@ -579,6 +579,108 @@ TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_ne
     EXPECT_EQ(drive.command.request, COMMAND_OFF) << "withdrawn";
 }
 
+// Members by which the drive finds others; without a limit where they are used a bit of them crashes this program.
+#define INDEX(member)                                                                                                  \
+    { #member, offsetof(drive_t, member), sizeof(drive_t{}.member) }
+const struct {
+    const char *name;
+    size_t at, bytes;
+} INDICES[] = {
+    INDEX(control.bandwidth.stage),
+    INDEX(control.lost_phase),
+    INDEX(control.duty.regulated),
+    INDEX(control.predictive.turn),
+    INDEX(control.predictive.column),
+    INDEX(control.deferred_request.input.bandwidth.stage),
+    INDEX(control.deferred_request.initial.predictive.conduction),
+    INDEX(control.deferred.response.latest),
+    INDEX(control.deferred.response.results[0].predictive.conduction),
+    INDEX(control.deferred.response.results[1].predictive.conduction),
+    INDEX(control.deferred.response.results[0].bandwidth),
+    INDEX(control.deferred.response.results[1].bandwidth),
+    INDEX(control.deferred.misalignment.phase_index),
+    INDEX(control.deferred.periodic_load.index),
+    INDEX(control.deferred.periodic_load.reviewed_index),
+    INDEX(control.deferred.stroke_mean.ended.phase),
+    INDEX(control.deferred.conduction.braking),
+    INDEX(control.deferred.conduction.latest),
+    INDEX(control.deferred.conduction_update),
+    INDEX(control.deferred.turn),
+    INDEX(degraded.lost),
+    INDEX(self_test.sum_word),
+    INDEX(self_test.crc_word),
+    INDEX(self_test.stack_word),
+    INDEX(comms.telemetry.queue.first),
+    INDEX(comms.telemetry.queue.count),
+    INDEX(comms.responses.first),
+    INDEX(comms.responses.count),
+    INDEX(store.waiting_count),
+    INDEX(trace.next),
+};
+
+TEST_F(Drive, a_flipped_bit_of_an_index_leads_nowhere_outside_of_its_array) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = controller};
+        hal.time_us += 100000;
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        counter = 0;
+        periods(100);
+        command(COMMAND_RUN);
+        run(0.05);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        const drive_t before = drive;
+        const hal_t board = hal;
+        for (const auto &index : INDICES) {
+            for (size_t bit = 0; bit < 8 * index.bytes; bit++) {
+                uint8_t *bytes = reinterpret_cast<uint8_t *>(&drive) + index.at;
+                bytes[bit / 8] = uint8_t(bytes[bit / 8] ^ 1u << bit % 8);
+                periods(40);
+                EXPECT_LT(unsigned(drive.control.state_machine.state), DRIVE_STATE_COUNT) << index.name << ' ' << bit;
+                drive = before;
+                hal = board;
+            }
+        }
+    }
+}
+
+TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const drive_t before = drive;
+    for (unsigned bit = 0; bit < 32; bit++) {
+        for (uint32_t *const note : {&drive.control.lost_phase, &drive.degraded.lost}) {
+            *note ^= UINT32_C(1) << bit;
+            periods(2);
+            EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY) << bit;
+            EXPECT_TRUE(hal.open) << bit;
+            drive = before;
+        }
+    }
+}
+
+TEST_F(Drive, a_state_that_is_none_is_the_fault_memory) {
+    periods(100);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    for (unsigned bit = 2; bit < 32; bit++) {
+        const drive_t before = drive;
+        drive.control.state_machine.state = drive_state_t(DRIVE_STATE_READY | 1u << bit);
+        periods(2);
+        EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY) << bit;
+        drive = before;
+    }
+}
+
+TEST_F(Drive, a_control_rate_that_has_changed_in_memory_gives_no_constants) {
+    periods(100);
+    drive.parameters.control_rate_hz ^= 1u << 14;
+    drive.parameters.revision++; // as a set would
+    periods(50);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
+    EXPECT_EQ(drive.self_test.failed & SELF_TEST_PARAMETERS, SELF_TEST_PARAMETERS);
+}
+
 TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     periods(100);
     command(COMMAND_RUN);

@@ -93,9 +93,9 @@ constexpr uint32_t STEP_US = 25;
 class Comms : public testing::Test {
   protected:
     Comms() {
-        drive.parameters.control_rate_hz = 40000;
         drive.control.state_machine.state = DRIVE_STATE_RUN;
         parameters_init(&parameters);
+        parameters_set_control_rate(&parameters, 40000);
         objects.parameters = &parameters;
         parameters_set(&parameters, PARAMETER_TELEMETRY_PERIOD_MS, 1);
         comms_init(&comms, 0, 0);
@@ -486,6 +486,61 @@ TEST_F(Comms, a_node_has_identifiers_of_its_own_and_ignores_those_of_others) {
     bus.received.push_back(hal_can_frame_t{0x1D3, false, false, 8, {}});
     run(107000);
     EXPECT_EQ(comms.bus.foreign_count, 1) << "its own";
+}
+
+TEST_F(Comms, a_node_is_heard_and_named_whatever_bit_of_its_offset_flips) {
+    for (unsigned bit = 0; bit < 32; bit++) {
+        for (unsigned copy = 0; copy < (bit < 16 ? 3u : 2u); copy++) {
+            comms_init(&comms, 5, 0);
+            time_us = 0;
+            bus.sent.clear();
+            accepted.clear();
+            run(500);
+            if (copy == 2) {
+                comms.commands.data_id_offset = uint16_t(comms.commands.data_id_offset ^ 1u << bit);
+            } else {
+                (copy == 0 ? comms.telemetry.identifier_offset : comms.node_offset) ^= UINT32_C(1) << bit;
+            }
+            hal_can_frame_t off{DRIVE_COMMAND_FRAME_ID + 0x50, false, false, 7, {}};
+            e2e_protect(uint16_t(DRIVE_COMMAND_E2E_DATA_ID + 0x50), 1, off.data, 7);
+            bus.received.push_back(off);
+            run(3000);
+            EXPECT_EQ(accepted.size(), 1u) << bit << ", " << copy;
+            for (const auto &frame : bus.sent) {
+                EXPECT_EQ(frame.identifier & 0x70, 0x50u) << bit << ", " << copy;
+            }
+        }
+    }
+}
+
+TEST_F(Comms, a_flipped_bit_of_a_count_or_of_the_next_time_silences_no_telemetry) {
+    const auto flipped = [this](auto &number, unsigned bit) {
+        number = std::remove_reference_t<decltype(number)>(number ^ UINT32_C(1) << bit);
+        bus.sent.clear();
+        run(time_us + 120000);
+        EXPECT_GE(bus.count(DRIVE_STATUS_FRAME_ID), 110u) << bit;
+        EXPECT_LE(bus.count(DRIVE_STATUS_FRAME_ID), 125u) << bit;
+        EXPECT_GE(bus.count(DRIVE_HEARTBEAT_FRAME_ID), 1u) << bit;
+    };
+    run(500);
+    for (unsigned bit = 0; bit < 32; bit++) {
+        flipped(comms.telemetry.next_us, bit);
+    }
+    for (uint16_t &count : comms.telemetry.countdown) {
+        flipped(count, 15);
+    }
+}
+
+TEST(FrameQueue, an_index_or_a_count_that_has_changed_leads_to_no_frame_outside_of_the_ring) {
+    for (unsigned bit = 0; bit < 8; bit++) {
+        frame_queue_t queue{};
+        queue.count = uint8_t(1u << bit);
+        EXPECT_LE(frame_queue_free(&queue), unsigned(FRAME_QUEUE_CAPACITY));
+        queue.first = uint8_t(1u << bit);
+        const hal_can_frame_t *frame = frame_queue_peek(&queue);
+        EXPECT_GE(frame, &queue.frames[0]);
+        EXPECT_LT(frame, &queue.frames[FRAME_QUEUE_CAPACITY]);
+    }
 }
 
 TEST_F(Comms, a_command_of_one_node_is_valid_for_no_other) {

@@ -211,6 +211,24 @@ TEST(Inertia, the_laws_follow_the_shift_and_saturate) {
     EXPECT_GT(inertia.laws.rate_q8, INT32_MAX - 4);
 }
 
+TEST(Inertia, a_shift_that_has_changed_in_memory_gives_laws_within_the_limits) {
+    const inertia_settings_t of = settings();
+    const inertia_parameters_t parameters = inertia_configure(&of);
+    for (unsigned bit = 0; bit < 32; bit++) {
+        inertia_t inertia{};
+        inertia_restart(&parameters, &MODEL, &inertia, 0);
+        for (unsigned step = 0; step < 8u << parameters.window_shift; step++) {
+            if (step == 20) {
+                inertia.shift = int32_t(UINT32_C(1) << bit);
+            }
+            inertia_step(&parameters, &MODEL, &inertia, 0, 0, true, true);
+        }
+        EXPECT_GE(inertia.laws.observer.load_shift, 0) << bit;
+        EXPECT_LE(inertia.laws.observer.load_shift, 4) << bit;
+        EXPECT_EQ(inertia.shift, bit < 2 ? 1 << bit : 0);
+    }
+}
+
 TEST(Inertia, an_identified_shift_changes_the_laws_within_the_run) {
     // shift_after() restarts before the run only.
     inertia_t inertia{};

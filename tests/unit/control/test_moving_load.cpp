@@ -36,6 +36,19 @@ uint32_t rounding_of(const moving_load_parameters_t &parameters, uint32_t angle_
     return result;
 }
 
+TEST(MovingLoad, a_least_distance_that_has_changed_in_memory_to_0_divides_nothing) {
+    const moving_load_settings_t of = settings();
+    const moving_load_parameters_t parameters = moving_load_configure(&of);
+    for (int changed = 1; changed < 6; changed++) {
+        moving_load_rounding_t rounding{};
+        for (int k = 0; k < 6; k++) {
+            rounding.least = k == changed ? 0 : rounding.least;
+            moving_load_rounding_q4(&parameters, &rounding, FAST);
+        }
+        EXPECT_GT(rounding.rounding_q4, 0u);
+    }
+}
+
 class Detector {
   public:
     explicit Detector(const moving_load_settings_t &of = settings()) : parameters(moving_load_configure(&of)) {}

@@ -171,7 +171,9 @@ class Machine {
             .angle_step = uint32_t(std::fabs(speed_rev) * REV),
             .flux_observer = &parameters.flux,
             .period_q40 = parameters.period_q40};
-        std::copy_n(control.column, PHASES, expected_column);
+        for (unsigned phase = 0; phase < PHASES; phase++) {
+            expected_column[phase] = std::clamp<int32_t>(control.column[phase], 0, parameters.column_max);
+        }
         predictive_torque_step(&parameters, &control, &machine_tables, &sample, duty_q15);
         model.step(seen);
         for (unsigned phase = 0; phase < PHASES; phase++) {
@@ -247,7 +249,7 @@ class Machine {
     const phase_cell_t &planned_cell(unsigned phase) const { return control.cell[control.turn ^ 1u][phase]; }
 
   private:
-    uint8_t expected_column[PHASES] = {};
+    int32_t expected_column[PHASES] = {};
 };
 
 // Electrical revolutions per period.
@@ -349,7 +351,7 @@ int repetitions_until_planned(uint32_t angle, double current_A, int column, int 
     const double torque_Nm = TABLES.torque(angle_rev, current_A), flux_Wb = TABLES.flux(angle_rev, current_A);
     predictive_torque_t control;
     predictive_torque_reset(&control);
-    control.column[0] = uint8_t(column);
+    control.column[0] = int8_t(column);
     control.position_q13[0] = last_column << 13;
     const int32_t current_q9[HAL_PHASES_MAX] = {};
     const int32_t flux[HAL_PHASES_MAX] = {to_fixed(flux_Wb, Q29) >> machine_tables.flux_format.result_shift};

@@ -184,6 +184,23 @@ TEST_F(SelfTest, a_bit_of_the_code_fails_within_two_passes_and_at_the_start_at_o
     }
 }
 
+TEST_F(SelfTest, a_place_beyond_the_last_word_ends_the_pass) {
+    for (unsigned bit = 12; bit < 32; bit++) {
+        for (const bool code_word : {false, true}) {
+            begin();
+            run(100000);
+            (code_word ? test.crc_word : test.sum_word) ^= UINT32_C(1) << bit;
+            EXPECT_LE(run(1000000), 2000u) << bit;
+            EXPECT_EQ(test.failed, code_word ? SELF_TEST_CODE : SELF_TEST_CONSTANTS) << bit;
+        }
+        begin();
+        test.stack_word ^= UINT32_C(1) << bit;
+        run(2000000);
+        EXPECT_EQ(test.stack_unused, 700u) << bit;
+        EXPECT_EQ(test.failed, 0u) << bit;
+    }
+}
+
 TEST_F(SelfTest, a_used_guard_word_fails_in_the_next_call) {
     stack[0] = 0;
     EXPECT_EQ(run(1000000), PERIOD_US);

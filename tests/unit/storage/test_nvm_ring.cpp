@@ -98,6 +98,27 @@ TEST_F(NvmRing, every_bit_of_a_committed_record_that_flips_makes_it_damaged_unti
     EXPECT_TRUE(has(1, 2));
 }
 
+TEST_F(NvmRing, a_place_that_has_changed_in_memory_is_written_within_both_pages_or_not_at_all) {
+    write(1);
+    step(payload_of(2));
+    const nvm_ring_t before = ring;
+    for (uint8_t nvm_ring_t::*const member : {&nvm_ring_t::newest_page, &nvm_ring_t::page, &nvm_ring_t::slot,
+                                              &nvm_ring_t::word, &nvm_ring_t::record_words}) {
+        for (unsigned changed = 0; changed < 256; changed++) {
+            ring = before;
+            ring.*member = uint8_t(changed);
+            const auto memory = hal.nvm;
+            step(payload_of(2));
+            for (unsigned page = 0; page < HAL_NVM_PAGES; page++) {
+                const bool own = page == PAGE || page == PAGE + 1;
+                EXPECT_TRUE(own || std::memcmp(memory.word[page], hal.nvm.word[page], sizeof memory.word[page]) == 0)
+                    << changed;
+            }
+            hal.nvm = memory;
+        }
+    }
+}
+
 TEST_F(NvmRing, an_unfinished_record_is_no_damage) {
     for (unsigned steps = 1; steps < RECORD_WORDS; steps++) {
         nvm_init(&hal.nvm);

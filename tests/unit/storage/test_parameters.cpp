@@ -50,8 +50,8 @@ TEST_F(StoredParameters, each_change_is_one_revision_and_leaves_them_intact) {
     EXPECT_TRUE(changed(0));
 }
 
-TEST_F(StoredParameters, every_bit_that_flips_in_a_value_the_controller_or_the_sum_is_noticed) {
-    for (unsigned i = 0; i < PARAMETER_COUNT + 2; i++) {
+TEST_F(StoredParameters, every_bit_that_flips_in_a_value_the_controller_the_rate_or_the_sum_is_noticed) {
+    for (unsigned i = 0; i < PARAMETER_COUNT + 3; i++) {
         for (unsigned bit = 0; bit < 32; bit++) {
             parameters_t flipped = parameters;
             const auto flip = [bit](auto &word) {
@@ -64,6 +64,8 @@ TEST_F(StoredParameters, every_bit_that_flips_in_a_value_the_controller_or_the_s
                 flip(flipped.values[i]);
             } else if (i == PARAMETER_COUNT) {
                 flip(flipped.controller_default);
+            } else if (i == PARAMETER_COUNT + 1) {
+                flip(flipped.control_rate_hz);
             } else {
                 flip(flipped.sum);
             }

@@ -62,6 +62,10 @@ class Layout:
         "padding of" a structure where no member has it."""
         return _member(self._type, bit, "")
 
+    def pointers(self) -> list[str]:
+        """Names of the members that are pointers, without the indices of arrays."""
+        return pointers(self._type)
+
     def bits(self, path: str) -> range:
         """Bits of a member, by the names from the outermost one on, joined by points. UsageError: there is none."""
         of, first, length = self._type, 0, 8 * self.size
@@ -81,6 +85,16 @@ def _word_at(elf: ELFFile, symbol: str) -> int:
         begin = found["st_value"] - section["sh_addr"]
         return int.from_bytes(section.data()[begin:begin + 4], "little")
     return 0
+
+
+def pointers(of: dict[str, Any], path: str = "") -> list[str]:
+    """Names of the pointers within a type, as Layout describes it."""
+    if "elements" in of:
+        return pointers(of["elements"][1], path)
+    found = [path] if of.get("pointer") else []
+    for _, _, name, inner in of.get("members", ()):
+        found += pointers(inner, f"{path}.{name}" if path and name else path or name)
+    return found
 
 
 def _find(dwarf: Any) -> Any:
@@ -117,6 +131,7 @@ def _described(entry: Any) -> dict[str, Any]:
                  for each in entry.iter_children() if each.tag == "DW_TAG_enumerator"}
         is_number = entry.tag in ("DW_TAG_base_type", "DW_TAG_enumeration_type")
         return {"bytes": _number(entry, "DW_AT_byte_size"), "is_number": is_number, "names": names,
+                "pointer": entry.tag == "DW_TAG_pointer_type",
                 "is_signed": _number(entry, "DW_AT_encoding") in _SIGNED or any(value < 0 for value in names)}
     members = []
     for each in entry.iter_children():
