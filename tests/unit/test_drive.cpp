@@ -786,6 +786,29 @@ TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
     EXPECT_EQ(only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack).armed, 1);
 }
 
+// At 40 kHz, with a background in each period or after many.
+TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_as_the_background_comes) {
+    const uint32_t &checked = drive.flux.residual.sample.periods;
+    periods(100);
+    uint32_t last = checked;
+    for (const unsigned each : {1u, 3u, 4u, 7u, 400u, 1u}) {
+        const unsigned apart = (each + 3) / each * each; // from 4 on
+        unsigned checks = 0;
+        for (unsigned k = 0; k < 12; k++) {
+            for (unsigned period = 1; period < each; period++) {
+                hal.time_us += 25;
+                drive_control_interrupt(&drive);
+                deferred_interrupt(&drive, &hal);
+            }
+            periods(1);
+            checks += checked != last;
+            EXPECT_TRUE(checked == last || checks == 1 || checked - last == apart) << each << " " << checked - last;
+            last = checked;
+        }
+        EXPECT_EQ(checks, 12 * each / apart) << each;
+    }
+}
+
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -1504,6 +1527,24 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     }
     EXPECT_EQ(seen, 15u);
     EXPECT_GT(*std::max_element(most_counts, most_counts + 3), 200u);
+}
+
+TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_limits_it) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = controller};
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        periods(100);
+        hal.from_drive.clear();
+        periods(4000); // the cycle of the message
+        const auto sent = only_frame(DRIVE_AVAILABLE_TORQUE_FRAME_ID, drive_available_torque_unpack);
+        const bool backwards = controller == DRIVE_CONTROLLER_SALIENT; // the other one has one quadrant
+        const int32_t most_q8 = (drive.parameters.values[PARAMETER_TORQUE_MAX_NM] + 32768) >> 16;
+        EXPECT_EQ(sent.forward_nm, most_q8);
+        EXPECT_EQ(sent.backward_nm, backwards ? -most_q8 : 0);
+        EXPECT_EQ(sent.forward_limited_by, DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_CURRENT_CHOICE);
+        EXPECT_EQ(sent.backward_limited_by, backwards ? DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CURRENT_CHOICE
+                                                      : DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CONTROLLER_CHOICE);
+    }
 }
 
 TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {

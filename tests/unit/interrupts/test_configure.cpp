@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <iterator>
 #include <random>
 #include <string>
 
@@ -15,6 +16,7 @@ extern "C" {
 #include "interrupts/deferred.h"
 }
 
+#include "support/configured.h"
 #include "support/reference_models.h"
 
 namespace {
@@ -303,6 +305,16 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
         SCOPED_TRACE(testing::Message() << "set " << i);
         ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25),
                                                  TIMER_CLOCKS_HZ[random() % 4]));
+    }
+}
+
+TEST(Configure, a_gain_of_the_pid_of_0_is_none) {
+    const parameter_index_t gains[] = {PARAMETER_BP_KP_MAX, PARAMETER_BP_KI_MAX, PARAMETER_BP_KD_MAX};
+    for (unsigned off = 0; off < std::size(gains); off++) {
+        const control_parameters_t c = configured(DRIVE_CONTROLLER_PAPER, 40000, 17, 12, {{gains[off], 0}});
+        for (unsigned k = 0; k < std::size(gains); k++) {
+            EXPECT_EQ(c.duty.pid.scale_q28[k] == 0, k == off) << off << " " << k;
+        }
     }
 }
 

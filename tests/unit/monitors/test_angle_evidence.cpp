@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include <gtest/gtest.h>
 
@@ -360,6 +361,21 @@ TEST_F(AngleEvidence, an_agreement_speaks_for_the_encoder_for_a_quarter_of_a_sec
         }
         EXPECT_EQ(monitor.angle, one.fails) << one.since_s << " " << one.in_run;
     }
+}
+
+TEST_F(AngleEvidence, the_end_of_a_run_changes_nothing_beyond_the_last_phase) {
+    struct {
+        angle_evidence_t state;
+        angle_evidence_phase_t beyond;
+    } memory{};
+    std::memset(&memory, 1, sizeof memory); // each bool of it is true
+    flux_residual_t residual{};
+    residual.phases = phases;
+    flux_evidence_t evidence{};
+    angle_evidence_step(&parameters, &memory.state, &residual, &evidence);
+    EXPECT_FALSE(memory.state.phase[HAL_PHASES_MAX - 1].agreed);
+    EXPECT_TRUE(memory.beyond.agreed);
+    EXPECT_TRUE(memory.state.advanced);
 }
 
 TEST_F(AngleEvidence, a_contradiction_of_the_run_before_is_no_company_of_a_faulty_phase) {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
+#include <utility>
 
 extern "C" {
 #include "monitors/flux_monitor.h"
@@ -238,12 +239,14 @@ TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
 
 // Phase b differs, c conducts at every angle, so that it agrees in each sample; a conducts in its turn or not at all.
 TEST_F(PhaseEvidence, one_phase_that_differs_for_long_is_none_until_each_of_the_others_has_agreed) {
-    for (unsigned a = 0; a < 3; a++) {
+    // 20 ms end between two strokes of b, or in one.
+    for (const auto &[a, in_a_revolution] :
+         {std::pair{0u, 256.0}, {1u, 256.0}, {2u, 256.0}, {0u, 264.0}, {1u, 264.0}, {2u, 264.0}}) {
         for (const bool conducts_too : {false, true}) {
             monitor = {};
             const unsigned b = (a + 1) % 3;
             const int periods = periods_to_fault(2000, [&](int) {
-                input.electrical += 1u << 24; // 256 periods in a revolution
+                input.electrical += uint32_t(0x1p32 / in_a_revolution);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     const uint32_t angle = input.electrical - phase * input.stroke;
                     const bool in_turn = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
