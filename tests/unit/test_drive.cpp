@@ -1,6 +1,7 @@
 // drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
@@ -15,6 +16,7 @@ extern "C" {
 #include "comms/e2e.h"
 #include "comms/node.h"
 #include "drive/drive.h"
+#include "drive/telemetry_collect.h"
 #include "drive_codec.h"
 #include "hal_adc.h"
 #include "hal_can.h"
@@ -1299,6 +1301,43 @@ TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_se
     arm(); // for tunable parameters
 }
 
+// A rotor at 9.6 rad/s, which a stop ramps down.
+TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
+    const auto turn = [this](int count) {
+        for (int k = 0; k < count; k++) {
+            hal.encoder_counts = (hal.encoder_counts + 5) % (1u << 17);
+            periods(1);
+        }
+    };
+    turn(100);
+    send(COMMAND_RUN);
+    hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+    turn(10);
+    hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    turn(100);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    send(COMMAND_STOP);
+    turn(10);
+    for (const unsigned index : {PARAMETER_BP_KP_MAX, PARAMETER_CURRENT_LIMIT_A}) {
+        const int32_t before = drive.parameters.values[index];
+        hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION));
+        turn(10);
+        hal.to_drive.push_back(
+            frames::arm(8, ARMING_STEP_CONFIRM_CONFIGURATION, ~drive.comms.commands.arming.challenge));
+        for (const hal_can_frame_t &frame : frames::parameter_set(9, {{index, before - 1}})) {
+            hal.to_drive.push_back(frame);
+        }
+        hal.from_drive.clear();
+        turn(10);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        ASSERT_EQ(drive.command.request, COMMAND_STOP);
+        const bool tunable = parameters_tunable(index);
+        EXPECT_EQ(set_response().status, tunable ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_WHILE_RUNNING);
+        EXPECT_EQ(drive.parameters.values[index], tunable ? before - 1 : before);
+        EXPECT_EQ(tunable, index == PARAMETER_BP_KP_MAX);
+    }
+}
+
 // The control parameters are always those of the whole set, though a run takes over parts of them only.
 TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     periods(100);
@@ -1544,6 +1583,36 @@ TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_
         EXPECT_EQ(sent.forward_limited_by, DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_CURRENT_CHOICE);
         EXPECT_EQ(sent.backward_limited_by, backwards ? DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CURRENT_CHOICE
                                                       : DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CONTROLLER_CHOICE);
+    }
+}
+
+TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_with_a_controller_of_one_quadrant) {
+    const auto limited = [this] {
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, hal.time_us, &telemetry);
+        return bool(telemetry.status.speed_limited);
+    };
+    periods(100);
+    EXPECT_FALSE(limited());
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_FALSE(limited());
+    send(COMMAND_RUN, -600.0);
+    periods(1);
+    EXPECT_TRUE(limited());
+    send(COMMAND_OFF, -600.0);
+    periods(2);
+    EXPECT_FALSE(limited());
+}
+
+TEST_F(Drive, telemetry_reports_the_resistance_of_the_parameter_and_what_is_found_beyond_it) {
+    const double ohm = drive.parameters.values[PARAMETER_RESISTANCE_OHM] / 16777216.0;
+    for (const double beyond_ohm : {0.0, 0.01, -0.01}) {
+        drive.table_scale.resistance_q40 = int32_t(std::lround(beyond_ohm * 25e-6 * 0x1p40));
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, 0, &telemetry);
+        EXPECT_NEAR(telemetry.estimates.resistance_ohm / 65536.0, ohm + beyond_ohm, 2.0 / 65536.0) << beyond_ohm;
     }
 }
 

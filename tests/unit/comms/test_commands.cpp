@@ -519,6 +519,21 @@ TEST_F(Commands, what_disarms) {
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+TEST_F(Commands, what_disarms_ends_an_attempt_to_arm_for_a_run_and_none_to_arm_for_configuration) {
+    for (const bool run : {true, false}) {
+        commands_init(&commands);
+        take(command_frame(1), DRIVE_STATE_READY, 10000);
+        take(frames::arm(7, run ? ARMING_STEP_REQUEST_RUN : ARMING_STEP_REQUEST_CONFIGURATION), DRIVE_STATE_READY,
+             11000);
+        const uint32_t response = ~commands.arming.challenge;
+        arming_disarm(&commands.arming);
+        take(frames::arm(8, run ? ARMING_STEP_CONFIRM_RUN : ARMING_STEP_CONFIRM_CONFIGURATION, response),
+             DRIVE_STATE_READY, 12000);
+        EXPECT_FALSE(commands.arming.armed) << run;
+        EXPECT_EQ(commands.arming.configuring != 0, !run);
+    }
+}
+
 TEST_F(Commands, an_arming_begins_without_errors_use_or_run_of_the_one_before) {
     arm(1, 10000);
     for (unsigned i = 0; i + 1 < COMMANDS_ERRORS_MAX; i++) {

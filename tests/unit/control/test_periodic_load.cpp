@@ -345,6 +345,34 @@ TEST(PeriodicLoad, without_a_bandwidth_or_beyond_a_delay_of_eight_values_nothing
     EXPECT_EQ(state.torque_q24, 0);
 }
 
+// The angle jumps by a third of a turn: values of before are no neighbours of those after it.
+TEST(PeriodicLoad, the_mean_over_a_pole_pitch_begins_anew_where_the_angle_jumps) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    const int32_t angle_step = int32_t(REV * 150.0 / 60.0 / RATE_HZ);
+    periodic_load_t load{};
+    uint32_t angle = 0;
+    const auto turn = [&](double turns) {
+        for (int k = 0; k < int(turns * REV / angle_step); k++, angle += uint32_t(angle_step)) {
+            const periodic_load_sample_t sample = {.angle = angle,
+                                                   .angle_step = angle_step,
+                                                   .load_torque_q24 = to_fixed(harmonics(0.0, angle / REV), Q24),
+                                                   .moving = false};
+            periodic_load_step(&parameters, &load, &sample);
+        }
+        int32_t sum_q8 = 0;
+        for (int value = 1; value <= PITCH; value++) {
+            sum_q8 += load.estimate_q8[(load.index - uint32_t(value)) % VALUES];
+        }
+        return sum_q8;
+    };
+    EXPECT_EQ(turn(1.5), load.window_q8);
+    angle += 1u << 30;
+    EXPECT_EQ(turn(0.7), load.window_q8);
+    EXPECT_EQ(load.window, unsigned(PITCH));
+    EXPECT_NE(load.window_q8, 0);
+}
+
 TEST(PeriodicLoad, the_window_of_a_pole_pitch_is_the_nearest_number_of_values) {
     for (unsigned poles = 1; poles <= 64; poles++) {
         const periodic_load_parameters_t parameters =

@@ -318,6 +318,21 @@ TEST(Configure, a_gain_of_the_pid_of_0_is_none) {
     }
 }
 
+TEST(Configure, the_gains_of_duty_control_refer_to_the_middle_between_turn_on_and_turn_off) {
+    for (const auto &[on_deg, off_deg] : {std::pair{185, 305}, {200, 320}}) {
+        const control_parameters_t c =
+            configured(DRIVE_CONTROLLER_PAPER, 40000, 17, 12,
+                       {{PARAMETER_TURN_ON_ANGLE_DEG, on_deg << 7}, {PARAMETER_TURN_OFF_ANGLE_DEG, off_deg << 7}});
+        const auto slope_at = [&](int32_t twice_deg) {
+            pwm_ditc_parameters_t at = c.duty;
+            pwm_ditc_set_reference_point(&at, &machine_tables, commutation_angle_from_degrees(twice_deg << 6), 1 << 20);
+            return at.torque_per_flux_q16;
+        };
+        EXPECT_EQ(c.duty.torque_per_flux_q16, slope_at(on_deg + off_deg)) << on_deg;
+        EXPECT_NE(c.duty.torque_per_flux_q16, slope_at(on_deg + off_deg - 4)) << on_deg;
+    }
+}
+
 TEST(Configure, a_machine_whose_current_hardly_rises_gets_the_largest_gain_and_not_a_wrapped_one) {
     static machine_tables_t slow = machine_tables;
     slow.current_slew_rate_A_s = 1;

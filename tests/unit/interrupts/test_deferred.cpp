@@ -646,6 +646,23 @@ TEST_F(Deferred, counts_of_an_encoder_of_13_bits_are_never_slow) {
     }
 }
 
+TEST_F(Deferred, while_counts_are_slow_a_load_limits_the_braking_torque_of_speed_mode_and_nothing_in_torque_mode) {
+    parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), 12).slow_counts;
+    start();
+    for (const bool torque_mode : {false, true}) {
+        command.mode = torque_mode ? DRIVE_MODE_TORQUE : DRIVE_MODE_SPEED;
+        command.torque_reference_q24 = -(2 << 24);
+        for (unsigned k = 0; k < RATE_HZ / 10; k++) {
+            interrupt(COMMAND_RUN);
+            state.deferred_request.input.load_torque_q24 = 3 << 24; // more than a sixteenth of the largest torque
+            deferred_step(&parameters, &state, &command);
+        }
+        ASSERT_TRUE(results().slow_counts.slow);
+        EXPECT_EQ(results().speed.torque_min_q24, torque_mode ? -(2 << 24) : 0);
+        EXPECT_EQ(results().speed.torque_max_q24, torque_mode ? -(2 << 24) : state.deferred.conduction.torque_max_q24);
+    }
+}
+
 TEST_F(Deferred, slow_counts_end_with_the_first_fast_one_and_with_a_reset_of_the_observer) {
     parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), 12).slow_counts;
     start();

@@ -60,6 +60,21 @@ TEST_F(SpeedControl, neither_no_load_nor_one_that_drives_limits_the_torque) {
     }
 }
 
+TEST_F(SpeedControl, a_commanded_speed_is_limited_to_that_of_the_drive_and_with_one_quadrant_to_0_backwards) {
+    for (const drive_controller_t controller :
+         {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        parameters = configured(controller, 40000, 17);
+        const int32_t max_q22 = parameters.speed_reference_max_q22;
+        const bool backwards = controller == DRIVE_CONTROLLER_SALIENT;
+        for (const int32_t commanded_q22 : {0, 1, 10 << 22, max_q22}) {
+            EXPECT_EQ(speed_control_limited_q22(&parameters, commanded_q22), commanded_q22);
+            EXPECT_EQ(speed_control_limited_q22(&parameters, -commanded_q22), backwards ? -commanded_q22 : 0);
+        }
+        EXPECT_EQ(speed_control_limited_q22(&parameters, max_q22 + 1), max_q22);
+        EXPECT_EQ(speed_control_limited_q22(&parameters, INT32_MIN), backwards ? -max_q22 : 0);
+    }
+}
+
 // In a run in speed mode, at its reference.
 TEST_F(SpeedControl, the_course_of_slow_counts_begins_at_the_angle_and_fast_counts_have_the_error_of_the_speed_alone) {
     constexpr uint32_t ANGLE = 0x12345678u;
@@ -136,6 +151,7 @@ TEST_F(SpeedControl, every_result_is_0_outside_of_a_run_and_the_reference_also_i
             deferred_results_t results{};
             results.speed = {1, 2, 3, 4, 5};
             speed_control_deferred(&parameters, &state.deferred, &input, &command, 20 * NM_Q24, &results);
+            EXPECT_EQ(state.deferred.mode, run ? mode : DRIVE_MODE_SPEED);
             const bool speed_law = run && mode == DRIVE_MODE_SPEED;
             EXPECT_EQ(results.speed.speed_reference_q22, speed_law ? state.deferred.speed_reference_q22 : 0);
             EXPECT_EQ(results.speed.speed_reference_q22 != 0, speed_law);

@@ -278,15 +278,33 @@ TEST_F(AngleEvidence, a_phase_has_company_while_another_has_contradicted_the_ang
 TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
     // By the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.
-    for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{0.05, true}}) {
+    const struct {
+        double part;
+        int begins;
+        bool frozen;
+    } cases[] = {{0.9, 50, false}, {0.05, 50, true}, {0.12, 1, false}, {0.05, 1, true}};
+    for (const auto &[part, begins, frozen] : cases) {
         monitor = {};
         double excess_Wb = 0.0;
         for (int k = 0; k < 400; k++) {
-            excess_Wb += k < 50 || excess_Wb > 0.1 ? 0.0 : part * 240.0 * PERIOD_S;
+            excess_Wb += k < begins || excess_Wb > 0.1 ? 0.0 : part * 240.0 * PERIOD_S;
             flux_offset_q29 = to_fixed(excess_Wb, Q29);
             step(75.0, 75.0, 25.0);
         }
-        EXPECT_EQ(monitor.frozen, frozen) << part;
+        EXPECT_EQ(monitor.frozen, frozen) << part << " " << begins;
+    }
+}
+
+TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_frozen_encoder) {
+    for (const bool jumps : {true, false}) {
+        monitor = {};
+        for (int k = 0; k < 400; k++) {
+            const double current_A = std::clamp(25.0 - 0.1 * (k - 50), 13.0, 25.0);
+            const double excess_Wb = k < 170 ? 0.0 : std::min(0.03, 0.05 * 240.0 * PERIOD_S * (jumps ? 1e3 : k - 170));
+            flux_offset_q29 = to_fixed(excess_Wb, Q29);
+            step(75.0, 75.0, current_A);
+        }
+        EXPECT_EQ(monitor.frozen, !jumps);
     }
 }
 

@@ -178,14 +178,15 @@ TEST_F(PhaseEvidence, current_of_a_phase_that_is_read_in_another_is_the_sensors)
 // electrical revolutions.
 class PhaseEvidenceInTurn : public PhaseEvidence {
   protected:
-    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution, int until = 1100) {
-        return periods_to_fault(1100, [&](int k) {
+    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution, int until = 1100, int each = 1) {
+        return periods_to_fault(1100 + 250 * (each - 1), [&](int k) {
             input.electrical += uint32_t(step_of_revolution * (1 << 24)); // 256 periods in a revolution
             for (unsigned phase = 0; phase < conduct; phase++) {
                 const uint32_t angle = input.electrical - phase * input.stroke;
                 const bool conducts = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
                 const double flux_Wb = phase_map_results::flux_q29(machine_tables, angle, 10 * 512) / Q29;
-                set(phase, conducts ? 10.0 : 0.0, conducts ? (phase < differ && k < until ? 1.8 : 1.0) * flux_Wb : 0.0);
+                set(phase, conducts ? 10.0 : 0.0,
+                    conducts ? (phase < differ && k < until && k / 256 % each == 0 ? 1.8 : 1.0) * flux_Wb : 0.0);
                 input.off[phase] = !conducts;
             }
         });
@@ -207,6 +208,13 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_its_first_stroke_only_is_n
         monitor = {};
         EXPECT_EQ(periods_with(1, 3, direction, 256), -1) << direction;
         EXPECT_EQ(monitor.phases_by_current.doubted, 0u) << direction;
+    }
+}
+
+TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_each_second_stroke_only_is_none) {
+    for (const int direction : {1, -1}) {
+        monitor = {};
+        EXPECT_EQ(periods_with(1, 3, direction, 2200, 2), -1) << direction;
     }
 }
 
