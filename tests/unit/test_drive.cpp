@@ -1606,6 +1606,64 @@ TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_w
     EXPECT_FALSE(limited());
 }
 
+#if HAL_PHASES_MAX > 4
+TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
+    for (unsigned phase = 0; phase < 6; phase++) {
+        drive.flux.phases = drive.degraded.lost = 1u << phase;
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, 0, &telemetry);
+        EXPECT_EQ(telemetry.phase_fault & 63u, 1u << phase);
+        EXPECT_EQ(telemetry.phases_e_f.phase_e, phase == 4);
+        EXPECT_EQ(telemetry.phases_e_f.phase_f, phase == 5);
+        EXPECT_EQ(telemetry.phases_e_f.lost_phase_e, phase == 4);
+        EXPECT_EQ(telemetry.phases_e_f.lost_phase_f, phase == 5);
+    }
+}
+#endif
+
+TEST_F(Drive, telemetry_names_the_lost_phase_s_limit_of_the_available_torque_whichever_is_lost) {
+    for (const uint32_t lost : {1u, 2u, 4u}) {
+        drive.degraded.lost = lost;
+        drive.degraded.angle = DEGRADED_ANGLES;
+        drive.degraded.mean_q24 = 3 << 24;
+        drive.degraded.most_q24 = 9 << 24;
+        drive.control_parameters.degraded.allowed = true;
+        periods(100);
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, hal.time_us, &telemetry);
+        EXPECT_EQ(telemetry.available_torque.forward_nm, 3 * 256) << lost;
+        EXPECT_EQ(telemetry.available_torque.forward_limited_by,
+                  DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_DEGRADED_CHOICE)
+            << lost;
+    }
+}
+
+TEST_F(Drive, the_scale_of_the_tables_that_has_been_found_takes_effect_in_the_interrupt_during_a_run) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    for (const double scale : {1.1, 0.9}) {
+        drive.table_scale.differs = true;
+        drive.table_scale.scale_q30 = drive.table_scale.smooth_q30 = int32_t(std::lround(scale * 0x1p30));
+        periods(10);
+        EXPECT_NEAR(drive.control.table_scale.excess_q31 / 0x1p31, scale - 1.0, 1e-4);
+        EXPECT_NEAR(drive.control.table_scale.inverse_excess_q31 / 0x1p31, 1.0 / scale - 1.0, 1e-4);
+    }
+}
+
+TEST_F(Drive, a_logged_fault_names_the_phases_that_have_had_one) {
+    periods(100);
+    drive.flux.phases = 4u;
+    hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_OVER_CURRENT;
+    periods(2000);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    hal.from_drive.clear();
+    hal.to_drive.push_back(frames::parameter_request(PARAMETER_OPERATION_FAULT_LOG, 0, 16, 1));
+    periods(10);
+    EXPECT_EQ(only_frame(DRIVE_PARAMETER_RESPONSE_FRAME_ID, drive_parameter_response_unpack).value, 4);
+}
+
 TEST_F(Drive, telemetry_reports_the_resistance_of_the_parameter_and_what_is_found_beyond_it) {
     const double ohm = drive.parameters.values[PARAMETER_RESISTANCE_OHM] / 16777216.0;
     for (const double beyond_ohm : {0.0, 0.01, -0.01}) {

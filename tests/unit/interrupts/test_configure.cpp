@@ -308,6 +308,17 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
     }
 }
 
+TEST(Configure, single_pulses_take_overlapping_windows_without_a_torque_reserve) {
+    for (const bool sharing : {false, true}) {
+        for (const int32_t reserve_q24 : {0, 1 << 24}) {
+            const control_parameters_t c =
+                configured(DRIVE_CONTROLLER_SALIENT, 40000, 17, 12,
+                           {{PARAMETER_TORQUE_SHARING, sharing}, {PARAMETER_TORQUE_RESERVE_NM, reserve_q24}});
+            EXPECT_EQ(c.conduction.single_pulse, sharing && reserve_q24 == 0) << sharing << " " << reserve_q24;
+        }
+    }
+}
+
 TEST(Configure, a_gain_of_the_pid_of_0_is_none) {
     const parameter_index_t gains[] = {PARAMETER_BP_KP_MAX, PARAMETER_BP_KI_MAX, PARAMETER_BP_KD_MAX};
     for (unsigned off = 0; off < std::size(gains); off++) {

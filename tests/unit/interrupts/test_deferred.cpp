@@ -8,6 +8,7 @@
 extern "C" {
 #include "interrupts/deferred.h"
 #include "interrupts/observe.h"
+#include "interrupts/torque_control.h"
 #include "storage/fault.h"
 }
 
@@ -560,8 +561,8 @@ TEST_F(Deferred, a_reference_is_approached_until_the_speed_has_been_within_a_16t
     start();
     double reference_rpm = 600.0;
     const int32_t limit_q24 = state.deferred.conduction.torque_max_q24;
-    for (const double off : {1.0 / 12.0, 1.0 / 20.0}) {
-        for (const bool limited : {true, false}) {
+    for (const double off : {1.0 / 20.0, 1.0 / 12.0}) {
+        for (const bool limited : {false, true}) {
             reference_rpm += 100.0;
             const double speed_rpm = reference_rpm * (1.0 - off);
             for (int k = 0; k < 2000; k++) {
@@ -592,6 +593,20 @@ TEST_F(Deferred, a_periodic_load_is_learned_in_turns_in_which_the_load_moves_and
             EXPECT_EQ(state.deferred.periodic_load.moved, moving && !constant) << moving << constant;
         }
     }
+}
+
+TEST_F(Deferred, a_run_on_a_rotor_that_turns_backwards_begins_with_the_limit_of_generating_phases) {
+    configure(DRIVE_CONTROLLER_TRADITIONAL);
+    speed_rad_s = -40.0;
+    for (int k = 0; k < 4000; k++) {
+        period(COMMAND_OFF);
+    }
+    ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    const ditc_hysteresis_limit_t generating = torque_control_limit(&parameters, state.observer.speed_q22);
+    ASSERT_LT(generating.current_q9, parameters.hysteresis.current_limit_q9);
+    ASSERT_TRUE(interrupt(COMMAND_RUN));
+    EXPECT_NEAR(results().limit.current_q9, generating.current_q9, 5);
+    EXPECT_EQ(results().limit.state, generating.state);
 }
 
 TEST_F(Deferred, the_network_of_the_pid_begins_anew_with_each_run) {

@@ -95,6 +95,21 @@ TEST_F(Observe, a_cleared_load_starts_at_the_maximum_bandwidth_with_angle_and_sp
     EXPECT_EQ(state.deferred_request.generation, before + DEFERRED_OBSERVER_STEP);
 }
 
+TEST_F(Observe, the_innovation_is_noted_for_the_deferred_step_as_the_observer_sees_it) {
+    for (const bool slow : {false, true}) {
+        for (const int32_t ahead : {-1000, 0, 1 << 20, 1 << 30}) {
+            reset();
+            deferred_results_t results{};
+            results.observer = load_observer_inertia(&parameters.observer, 0);
+            results.slow_counts.slow = slow;
+            state.measurement.angle = uint32_t(ahead);
+            state.innovation = 99;
+            observe(&parameters, &state, &results);
+            EXPECT_EQ(state.innovation, std::min(ahead, LIMIT_HIGH)) << slow;
+        }
+    }
+}
+
 TEST_F(Observe, a_count_that_does_not_change_limits_the_speed_in_both_directions_and_one_that_does_not) {
     constexpr int32_t MAX_Q22 = 1 << 20;
     for (const bool same : {true, false}) {

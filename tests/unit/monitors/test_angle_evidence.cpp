@@ -295,6 +295,18 @@ TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_fro
     }
 }
 
+// At nine tenths of the tolerated error of the voltage, for longer than the time constant of the leak.
+TEST_F(AngleEvidence, an_integral_that_drifts_by_less_than_the_tolerated_error_for_long_is_no_frozen_encoder) {
+    for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{-0.9, false}, std::pair{2.0, true}}) {
+        monitor = {};
+        for (int k = 0; k < RATE_HZ / 40; k++) {
+            flux_offset_q29 = int32_t(part * k * parameters.flux_error_q29);
+            step(75.0, 75.0, 25.0);
+        }
+        EXPECT_EQ(monitor.frozen, frozen) << part;
+    }
+}
+
 TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_frozen_encoder) {
     for (const bool jumps : {true, false}) {
         monitor = {};

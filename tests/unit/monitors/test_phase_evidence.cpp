@@ -174,6 +174,48 @@ TEST_F(PhaseEvidence, current_of_a_phase_that_is_read_in_another_is_the_sensors)
     EXPECT_EQ(monitor.phases, 3u);
 }
 
+// The current of phase 0 ends at once, or does not begin although there is voltage; phase 1, which is off, has one.
+TEST_F(PhaseEvidence, a_current_that_ends_or_does_not_begin_is_the_sensors_when_another_phase_has_one_that_moves) {
+    input.electrical = MIDDLE;
+    for (const bool ends : {true, false}) {
+        monitor = {};
+        const int periods = periods_to_fault(100, [&](int k) {
+            input.current_q9[1] = k < 20 ? 0 : (10 + k - 20) * 512;
+            if (ends && k < 20) {
+                set(0, 10.0, table_Wb(10.0));
+            } else if (ends) {
+                set(0, 0.0, k == 20 ? table_Wb(10.0) : 0.0);
+                input.off[0] = true;
+            } else {
+                set(0, 0.0, k < 20 ? 0.0 : 8e-3); // within the drop of the devices
+            }
+        });
+        EXPECT_GT(periods, 20) << ends;
+        EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR)) << ends;
+        EXPECT_EQ(monitor.phases, 3u) << ends;
+    }
+}
+
+// Both switches open at the aligned position: parts of what the voltage removes, less its tolerance for delays.
+TEST_F(PhaseEvidence, a_current_that_falls_by_less_than_a_quarter_of_what_the_voltage_removes_is_a_shorted_phase) {
+    for (const double part : {0.1, 0.21, 0.26, 0.5}) {
+        monitor = {};
+        input.electrical = 0;
+        const double flux_Wb = table_Wb(20.0);
+        periods_to_fault(80, [&](int k) {
+            const double removed = std::clamp((k - 20) / 50.0, 0.0, 0.7);
+            const double seen_Wb = flux_Wb * (1.0 - part * removed);
+            double current_A = 20.0;
+            while (table_Wb(current_A) > seen_Wb) {
+                current_A -= 0.01;
+            }
+            set(0, current_A, flux_Wb * (1.0 - removed));
+            input.off[0] = k >= 20;
+        });
+        EXPECT_EQ(failed, part < 0.25 ? FAULT_BIT(FAULT_PHASE_SHORTED) : 0u) << part;
+    }
+}
+
 // Differences that an angle explains: `differ` of three phases, of which `conduct` conduct in turn, over more than four
 // electrical revolutions.
 class PhaseEvidenceInTurn : public PhaseEvidence {
