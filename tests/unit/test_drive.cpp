@@ -1606,6 +1606,28 @@ TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_w
     EXPECT_FALSE(limited());
 }
 
+TEST_F(Drive, the_background_leaves_what_belongs_to_no_phase_of_the_machine_as_it_is) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_LT(machine_tables.phases, HAL_PHASES_MAX);
+    const unsigned beyond = machine_tables.phases;
+    table_scale_phase_t &interval = drive.table_scale.phase[beyond];
+    for (const bool run : {false, true}) {
+        periods(100);
+        if (run) {
+            command(COMMAND_RUN);
+            periods(10);
+        }
+        ASSERT_EQ(drive.control.state_machine.state, run ? DRIVE_STATE_RUN : DRIVE_STATE_READY);
+        drive.control.flux_misalignment[beyond] = 99;
+        interval.whole = true;
+        interval.current_q9 = 99;
+        periods(20);
+        EXPECT_EQ(drive.control.flux_misalignment[beyond], 99) << run;
+        EXPECT_TRUE(interval.whole && !interval.ended) << run;
+    }
+}
+
 #if HAL_PHASES_MAX > 4
 TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
     for (unsigned phase = 0; phase < 6; phase++) {
