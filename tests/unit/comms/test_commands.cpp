@@ -9,7 +9,6 @@ extern "C" {
 #include "comms/arming.h"
 #include "comms/commands.h"
 #include "comms/counter.h"
-#include "comms/parameter_set.h"
 #include "drive_codec.h"
 #include "hal_random.h"
 #include "storage/parameters.h"
