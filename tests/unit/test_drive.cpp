@@ -1,6 +1,7 @@
 // drive.c between a HAL that remembers and the laws: what it starts, writes, opens and passes on.
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
@@ -15,6 +16,7 @@ extern "C" {
 #include "comms/e2e.h"
 #include "comms/node.h"
 #include "drive/drive.h"
+#include "drive/telemetry_collect.h"
 #include "drive_codec.h"
 #include "hal_adc.h"
 #include "hal_can.h"
@@ -888,6 +890,29 @@ TEST_F(Drive, reports_its_arming_at_once_and_then_cyclically) {
     EXPECT_EQ(only_frame(DRIVE_ARMING_FRAME_ID, drive_arming_unpack).armed, 1);
 }
 
+// At 40 kHz, with a background in each period or after many.
+TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_as_the_background_comes) {
+    const uint32_t &checked = drive.flux.residual.sample.periods;
+    periods(100);
+    uint32_t last = checked;
+    for (const unsigned each : {1u, 3u, 4u, 7u, 400u, 1u}) {
+        const unsigned apart = (each + 3) / each * each; // from 4 on
+        unsigned checks = 0;
+        for (unsigned k = 0; k < 12; k++) {
+            for (unsigned period = 1; period < each; period++) {
+                hal.time_us += 25;
+                drive_control_interrupt(&drive);
+                deferred_interrupt(&drive, &hal);
+            }
+            periods(1);
+            checks += checked != last;
+            EXPECT_TRUE(checked == last || checks == 1 || checked - last == apart) << each << " " << checked - last;
+            last = checked;
+        }
+        EXPECT_EQ(checks, 12 * each / apart) << each;
+    }
+}
+
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -1378,6 +1403,43 @@ TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_se
     arm(); // for tunable parameters
 }
 
+// A rotor at 9.6 rad/s, which a stop ramps down.
+TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
+    const auto turn = [this](int count) {
+        for (int k = 0; k < count; k++) {
+            hal.encoder_counts = (hal.encoder_counts + 5) % (1u << 17);
+            periods(1);
+        }
+    };
+    turn(100);
+    send(COMMAND_RUN);
+    hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_RUN));
+    turn(10);
+    hal.to_drive.push_back(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~drive.comms.commands.arming.challenge));
+    turn(100);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    send(COMMAND_STOP);
+    turn(10);
+    for (const unsigned index : {PARAMETER_BP_KP_MAX, PARAMETER_CURRENT_LIMIT_A}) {
+        const int32_t before = drive.parameters.values[index];
+        hal.to_drive.push_back(frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION));
+        turn(10);
+        hal.to_drive.push_back(
+            frames::arm(8, ARMING_STEP_CONFIRM_CONFIGURATION, ~drive.comms.commands.arming.challenge));
+        for (const hal_can_frame_t &frame : frames::parameter_set(9, {{index, before - 1}})) {
+            hal.to_drive.push_back(frame);
+        }
+        hal.from_drive.clear();
+        turn(10);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        ASSERT_EQ(drive.command.request, COMMAND_STOP);
+        const bool tunable = parameters_tunable(index);
+        EXPECT_EQ(set_response().status, tunable ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_WHILE_RUNNING);
+        EXPECT_EQ(drive.parameters.values[index], tunable ? before - 1 : before);
+        EXPECT_EQ(tunable, index == PARAMETER_BP_KP_MAX);
+    }
+}
+
 // The control parameters are always those of the whole set, though a run takes over parts of them only.
 TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     periods(100);
@@ -1606,6 +1668,134 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     }
     EXPECT_EQ(seen, 15u);
     EXPECT_GT(*std::max_element(most_counts, most_counts + 3), 200u);
+}
+
+TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_limits_it) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = controller};
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        periods(100);
+        hal.from_drive.clear();
+        periods(4000); // the cycle of the message
+        const auto sent = only_frame(DRIVE_AVAILABLE_TORQUE_FRAME_ID, drive_available_torque_unpack);
+        const bool backwards = controller == DRIVE_CONTROLLER_SALIENT; // the other one has one quadrant
+        const int32_t most_q8 = (drive.parameters.values[PARAMETER_TORQUE_MAX_NM] + 32768) >> 16;
+        EXPECT_EQ(sent.forward_nm, most_q8);
+        EXPECT_EQ(sent.backward_nm, backwards ? -most_q8 : 0);
+        EXPECT_EQ(sent.forward_limited_by, DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_CURRENT_CHOICE);
+        EXPECT_EQ(sent.backward_limited_by, backwards ? DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CURRENT_CHOICE
+                                                      : DRIVE_AVAILABLE_TORQUE_BACKWARD_LIMITED_BY_CONTROLLER_CHOICE);
+    }
+}
+
+TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_with_a_controller_of_one_quadrant) {
+    const auto limited = [this] {
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, hal.time_us, &telemetry);
+        return bool(telemetry.status.speed_limited);
+    };
+    periods(100);
+    EXPECT_FALSE(limited());
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_FALSE(limited());
+    send(COMMAND_RUN, -600.0);
+    periods(1);
+    EXPECT_TRUE(limited());
+    send(COMMAND_OFF, -600.0);
+    periods(2);
+    EXPECT_FALSE(limited());
+}
+
+TEST_F(Drive, the_background_leaves_what_belongs_to_no_phase_of_the_machine_as_it_is) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_LT(machine_tables.phases, HAL_PHASES_MAX);
+    const unsigned beyond = machine_tables.phases;
+    table_scale_phase_t &interval = drive.table_scale.phase[beyond];
+    for (const bool run : {false, true}) {
+        periods(100);
+        if (run) {
+            command(COMMAND_RUN);
+            periods(10);
+        }
+        ASSERT_EQ(drive.control.state_machine.state, run ? DRIVE_STATE_RUN : DRIVE_STATE_READY);
+        drive.control.flux_misalignment[beyond] = 99;
+        interval.whole = true;
+        interval.current_q9 = 99;
+        periods(20);
+        EXPECT_EQ(drive.control.flux_misalignment[beyond], 99) << run;
+        EXPECT_TRUE(interval.whole && !interval.ended) << run;
+    }
+}
+
+#if HAL_PHASES_MAX > 4
+TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
+    for (unsigned phase = 0; phase < 6; phase++) {
+        drive.flux.phases = drive.degraded.lost = 1u << phase;
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, 0, &telemetry);
+        EXPECT_EQ(telemetry.phase_fault & 63u, 1u << phase);
+        EXPECT_EQ(telemetry.phases_e_f.phase_e, phase == 4);
+        EXPECT_EQ(telemetry.phases_e_f.phase_f, phase == 5);
+        EXPECT_EQ(telemetry.phases_e_f.lost_phase_e, phase == 4);
+        EXPECT_EQ(telemetry.phases_e_f.lost_phase_f, phase == 5);
+    }
+}
+#endif
+
+TEST_F(Drive, telemetry_names_the_lost_phase_s_limit_of_the_available_torque_whichever_is_lost) {
+    for (const uint32_t lost : {1u, 2u, 4u}) {
+        drive.degraded.lost = lost;
+        drive.degraded.angle = DEGRADED_ANGLES;
+        drive.degraded.mean_q24 = 3 << 24;
+        drive.degraded.most_q24 = 9 << 24;
+        drive.control_parameters.degraded.allowed = true;
+        periods(100);
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, hal.time_us, &telemetry);
+        EXPECT_EQ(telemetry.available_torque.forward_nm, 3 * 256) << lost;
+        EXPECT_EQ(telemetry.available_torque.forward_limited_by,
+                  DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_DEGRADED_CHOICE)
+            << lost;
+    }
+}
+
+TEST_F(Drive, the_scale_of_the_tables_that_has_been_found_takes_effect_in_the_interrupt_during_a_run) {
+    periods(100);
+    command(COMMAND_RUN);
+    periods(10);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    for (const double scale : {1.1, 0.9}) {
+        drive.table_scale.differs = true;
+        drive.table_scale.scale_q30 = drive.table_scale.smooth_q30 = int32_t(std::lround(scale * 0x1p30));
+        periods(10);
+        EXPECT_NEAR(drive.control.table_scale.excess_q31 / 0x1p31, scale - 1.0, 1e-4);
+        EXPECT_NEAR(drive.control.table_scale.inverse_excess_q31 / 0x1p31, 1.0 / scale - 1.0, 1e-4);
+    }
+}
+
+TEST_F(Drive, a_logged_fault_names_the_phases_that_have_had_one) {
+    periods(100);
+    drive.flux.phases = 4u;
+    hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_OVER_CURRENT;
+    periods(2000);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    hal.from_drive.clear();
+    hal.to_drive.push_back(frames::parameter_request(PARAMETER_OPERATION_FAULT_LOG, 0, 16, 1));
+    periods(10);
+    EXPECT_EQ(only_frame(DRIVE_PARAMETER_RESPONSE_FRAME_ID, drive_parameter_response_unpack).value, 4);
+}
+
+TEST_F(Drive, telemetry_reports_the_resistance_of_the_parameter_and_what_is_found_beyond_it) {
+    const double ohm = drive.parameters.values[PARAMETER_RESISTANCE_OHM] / 16777216.0;
+    for (const double beyond_ohm : {0.0, 0.01, -0.01}) {
+        drive.table_scale.resistance_q40 = int32_t(std::lround(beyond_ohm * 25e-6 * 0x1p40));
+        drive_telemetry_t telemetry;
+        telemetry_collect(&drive, 0, &telemetry);
+        EXPECT_NEAR(telemetry.estimates.resistance_ohm / 65536.0, ohm + beyond_ohm, 2.0 / 65536.0) << beyond_ohm;
+    }
 }
 
 TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {

@@ -11,6 +11,7 @@ extern "C" {
 #include "comms/counter.h"
 #include "drive_codec.h"
 #include "hal_random.h"
+#include "storage/parameters.h"
 }
 #include "support/frames.h"
 
@@ -518,6 +519,43 @@ TEST_F(Commands, what_disarms) {
     // Each of them takes a new sequence: one command does not run.
     receive(command_frame(4), 13000);
     EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(Commands, what_disarms_ends_an_attempt_to_arm_for_a_run_and_none_to_arm_for_configuration) {
+    for (const bool run : {true, false}) {
+        commands_init(&commands);
+        take(command_frame(1), DRIVE_STATE_READY, 10000);
+        take(frames::arm(7, run ? ARMING_STEP_REQUEST_RUN : ARMING_STEP_REQUEST_CONFIGURATION), DRIVE_STATE_READY,
+             11000);
+        const uint32_t response = ~commands.arming.challenge;
+        arming_disarm(&commands.arming);
+        take(frames::arm(8, run ? ARMING_STEP_CONFIRM_RUN : ARMING_STEP_CONFIRM_CONFIGURATION, response),
+             DRIVE_STATE_READY, 12000);
+        EXPECT_FALSE(commands.arming.armed) << run;
+        EXPECT_EQ(commands.arming.configuring != 0, !run);
+    }
+}
+
+TEST_F(Commands, a_frame_of_a_set_with_an_index_or_a_step_that_there_is_not_is_out_of_range) {
+    const struct {
+        bool control;
+        unsigned index, end;
+    } cases[] = {{false, PARAMETER_COUNT - 1, PARAMETER_COUNT},
+                 {false, PARAMETER_COUNT, PARAMETER_COUNT},
+                 {false, 255, PARAMETER_COUNT},
+                 {true, PARAMETER_SET_STEP_SAVE, PARAMETER_SET_STEP_SAVE + 1},
+                 {true, PARAMETER_SET_STEP_SAVE + 1, PARAMETER_SET_STEP_SAVE + 1}};
+    for (const auto &[control, index, end] : cases) {
+        commands_init(&commands);
+        take(frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION), DRIVE_STATE_READY, 11000);
+        take(frames::arm(8, ARMING_STEP_CONFIRM_CONFIGURATION, ~commands.arming.challenge), DRIVE_STATE_READY, 12000);
+        ASSERT_TRUE(commands.arming.configuring);
+        const hal_can_frame_t frame =
+            control ? frames::parameter_set_control(9, index) : frames::parameter_write(9, index, 0);
+        const bool there = index < end;
+        EXPECT_EQ(take(frame, DRIVE_STATE_READY, 12000), there ? COMMANDS_PARAMETER_SET : COMMANDS_REJECTED) << index;
+        EXPECT_EQ(commands.counters.out_of_range, there ? 0 : 1) << index;
+    }
 }
 
 TEST_F(Commands, an_arming_begins_without_errors_use_or_run_of_the_one_before) {

@@ -617,6 +617,16 @@ TEST_F(Comms, values_collected_just_before_the_cycle_is_due_keep_the_grid) {
     }
 }
 
+TEST_F(Comms, values_collected_when_the_next_cycle_is_due_are_of_the_one_before_and_the_next_one_is_left_out) {
+    ASSERT_TRUE(comms_telemetry_due(&comms, 0));
+    report(0);
+    for (uint32_t cycle = 1; cycle < 10; cycle++) {
+        report(cycle * 2000); // due at 1,000 us less
+        ASSERT_FALSE(comms_telemetry_due(&comms, cycle * 2000 + 999)) << cycle;
+        ASSERT_TRUE(comms_telemetry_due(&comms, cycle * 2000 + 1000)) << cycle;
+    }
+}
+
 TEST_F(Comms, cycles_go_on_across_the_wrap_of_the_clock) {
     const uint32_t start = UINT32_MAX - 2499;
     comms_init(&comms, 0, start);

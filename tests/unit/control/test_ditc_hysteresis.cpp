@@ -1,4 +1,5 @@
 // The rule table of hysteresis DITC, exhaustively.
+#include <algorithm>
 #include <cstdint>
 
 #include <gtest/gtest.h>
@@ -173,6 +174,20 @@ TEST(DitcHysteresis, in_a_commutation_gap_and_after_reset_all_phases_are_off) {
             EXPECT_EQ(state, -ONE_Q15);
         }
     }
+}
+
+TEST(DitcHysteresis, no_state_beyond_the_last_phase_is_written) {
+    commutation_t commutation{};
+    commutation.active = 1;
+    commutation.outgoing = 0;
+    const int32_t current_q9[HAL_PHASES_MAX] = {100, 100, 100, 100};
+    int32_t duty_q15[HAL_PHASES_MAX + 1];
+    std::fill_n(duty_q15, HAL_PHASES_MAX + 1, 123);
+    ditc_hysteresis_reset(duty_q15);
+    EXPECT_EQ(duty_q15[HAL_PHASES_MAX], 123);
+    ditc_hysteresis_step(&PARAMETERS, &commutation, INT32_MAX, current_q9, ditc_hysteresis_limit(&PARAMETERS, 0),
+                         duty_q15);
+    EXPECT_EQ(duty_q15[HAL_PHASES_MAX], 123);
 }
 
 TEST(DitcHysteresis, extreme_bands_do_not_overflow) {

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include <gtest/gtest.h>
 
@@ -118,6 +119,23 @@ TEST_F(FluxAngle, is_not_solved_in_the_first_half_second) {
     EXPECT_GT(solutions, 0);
 }
 
+// 4.5 ms of 10, each with ten samples.
+TEST_F(FluxAngle, of_a_phase_that_conducts_for_nearly_half_of_the_time_is_solved_from_1_1_s_on_each_57_ms) {
+    flux_residual_phase_t conducting = {};
+    conducting.angle = 0xb0000000u;
+    conducting.current_q9 = 10 * 512;
+    conducting.voltage_q29 = conducting.table_q29 = 1 << 26;
+    std::vector<double> solved_s;
+    for (int k = 0; k < 30000; k++) {
+        if (add(k % 100 < 45 ? conducting : flux_residual_phase_t{})) {
+            solved_s.push_back(k * SAMPLE_S);
+        }
+    }
+    ASSERT_GT(solved_s.size(), 20u);
+    EXPECT_NEAR(solved_s.front(), 1.1, 0.05);
+    EXPECT_NEAR((solved_s.back() - solved_s.front()) / double(solved_s.size() - 1), 0.057, 0.001);
+}
+
 TEST_F(FluxAngle, is_unknown_while_a_conduction_lasts_longer_than_it_is_remembered) {
     rpm = 5.0;
     misalignment_deg = 0.3;
@@ -126,6 +144,21 @@ TEST_F(FluxAngle, is_unknown_while_a_conduction_lasts_longer_than_it_is_remember
     run(4.0);
     EXPECT_GT(solutions, 10);
     EXPECT_EQ(solved_deg, 0.0);
+}
+
+TEST_F(FluxAngle, is_unknown_from_a_conduction_that_has_become_too_long_until_a_whole_shorter_one_has_ended) {
+    const auto conduct = [&](double speed_rpm, double seconds) { // from the begin of a conduction
+        add({});
+        rpm = speed_rpm;
+        run(seconds);
+        return flux_angle_solve(&state) / REV / machine_tables.rotor_poles * 360.0;
+    };
+    misalignment_deg = 0.3;
+    EXPECT_NEAR(conduct(150.0, 2.0), 0.3, 0.05);
+    EXPECT_NE(conduct(5.0, 0.40), 0.0) << "4,000 samples";
+    EXPECT_EQ(conduct(5.0, 0.42), 0.0) << "more than 4,096, after a shorter one";
+    EXPECT_EQ(conduct(150.0, 0.01), 0.0) << "a part of a conduction, after a longer one";
+    EXPECT_NEAR(conduct(150.0, 1.0), 0.3, 0.05);
 }
 
 TEST_F(FluxAngle, is_unknown_without_a_course_of_its_own) {
@@ -156,7 +189,14 @@ TEST_F(FluxAngle, samples_that_show_no_angle_are_not_counted) {
         return state.samples;
     };
     EXPECT_EQ(samples([](flux_residual_t &) {}), 1u);
-    EXPECT_EQ(samples([](flux_residual_t &residual) { residual.sample.speed_q22 = 1 << 21; }), 0u);
+    for (const double direction : {1.0, -1.0}) {
+        const auto at_rad_s = [&](double speed_rad_s) {
+            return samples(
+                [=](flux_residual_t &residual) { residual.sample.speed_q22 = to_fixed(direction * speed_rad_s, Q22); });
+        };
+        EXPECT_EQ(at_rad_s(0.5), 0u);
+        EXPECT_EQ(at_rad_s(0.51), 1u);
+    }
     EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].known = false; }), 0u);
     EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].off = true; }), 0u);
     EXPECT_EQ(samples([](flux_residual_t &residual) { residual.phase[0].current_q9 = 512; }), 0u);

@@ -95,4 +95,52 @@ TEST_F(FluxResidual, limits_of_psi_enclose_the_tables_at_every_resistance_of_a_w
     }
 }
 
+// The error of the voltage acts for so many periods: until the phase is at rest, at most the time constant of 10 ms.
+TEST_F(FluxResidual, periods_of_the_voltage_s_error_count_up_to_10_ms_twice_with_a_small_current_and_not_at_rest) {
+    const flux_residual_phase_t &phase = residual.phase[0];
+    const auto conduct = [&](double current_A, int periods) {
+        for (int k = 0; k < periods; k++) {
+            set(0, current_A, table_Wb(current_A));
+            step();
+        }
+        return phase.conducting;
+    };
+    input.electrical = MIDDLE;
+    EXPECT_EQ(conduct(10.0, 100), 100u);
+    EXPECT_EQ(conduct(10.0, 400), 400u) << "10 ms";
+    EXPECT_EQ(conduct(1.0, 100), 600u);
+    EXPECT_EQ(conduct(1.0, 400), 800u) << "twice 10 ms";
+    EXPECT_EQ(conduct(10.0, 100), 600u) << "what was small has been corrected";
+    EXPECT_EQ(conduct(10.0, 400), 400u);
+    set(0, 0.0, 0.0);
+    input.off[0] = true;
+    for (int k = 0; k < 100; k++) {
+        step();
+    }
+    EXPECT_TRUE(phase.at_rest);
+    EXPECT_EQ(phase.conducting, 0u);
+    EXPECT_EQ(phase.peak_q29, 0);
+    EXPECT_EQ(conduct(10.0, 1), 1u);
+}
+
+// A constant error of the voltage over ten time constants, at the same current and angle.
+TEST_F(FluxResidual, limits_of_psi_enclose_the_tables_with_a_voltage_that_is_off_by_a_64th_and_not_by_a_32nd) {
+    input.electrical = MIDDLE;
+    for (const auto &[part, within] :
+         {std::pair{1.0 / 64.0, true}, {-1.0 / 64.0, true}, {1.0 / 32.0, false}, {-1.0 / 32.0, false}}) {
+        residual = {};
+        double error_Wb = 0.0;
+        for (int k = 0; k < 4000; k++) {
+            set(0, 10.0, table_Wb(10.0) + error_Wb);
+            step();
+            error_Wb += part * PERIOD_Q29 / Q29 + correction_q29[0] / Q29;
+        }
+        const int32_t table_q29 = residual.phase[0].table_q29;
+        EXPECT_EQ(flux_residual_least_q29(&residual, 0) <= table_q29 &&
+                      flux_residual_most_q29(&residual, 0) >= table_q29,
+                  within)
+            << part;
+    }
+}
+
 } // namespace

@@ -83,6 +83,31 @@ TEST(Inertia, a_start_under_load_identifies_a_fifth_to_five_times_to_the_nearest
     }
 }
 
+// One count of the angle as torque: J0 d2(angle) / window^2.
+TEST(Inertia, a_window_is_as_short_as_0_8_ms_and_the_24th_of_the_largest_torque_that_a_count_is_at_most_allow) {
+    int by_count = 0, by_time = 0;
+    for (const unsigned bits : {10u, 14u, 17u}) {
+        for (double inertia = 1e-3; inertia < 0.05; inertia *= 1.01) {
+            inertia_settings_t of = settings(bits);
+            of.inertia_q30 = to_fixed(inertia, Q30);
+            const double update_s = double(of.periods_per_update) / of.control_rate_hz;
+            const unsigned shift = inertia_configure(&of).window_shift;
+            const auto window_s = [&](unsigned k) { return std::ldexp(update_s, int(k)); };
+            const auto count_Nm = [&](unsigned k) {
+                return inertia * 2.0 * PI / std::ldexp(1.0, int(bits)) / (window_s(k) * window_s(k));
+            };
+            EXPECT_GE(window_s(shift), 0.8e-3);
+            EXPECT_LT(count_Nm(shift), TORQUE_MAX / 24.0 * 1.01) << bits << " bits, " << inertia;
+            const bool shorter = window_s(shift - 1) >= 0.8e-3;
+            EXPECT_TRUE(!shorter || count_Nm(shift - 1) > TORQUE_MAX / 24.0 * 0.99) << bits << " bits, " << inertia;
+            by_count += shorter;
+            by_time += !shorter;
+        }
+    }
+    EXPECT_GT(by_count, 200);
+    EXPECT_GT(by_time, 200);
+}
+
 TEST(Inertia, a_torque_that_follows_a_load_identifies_nothing) {
     const auto limited = [](double torque_Nm) { return std::min(torque_Nm, TORQUE_MAX); };
     const torque_t step = [](double t) { return t < 0.1 ? 0.0 : 15.0; };

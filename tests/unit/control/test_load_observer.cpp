@@ -112,6 +112,33 @@ TEST(LoadObserver, gains_at_a_megahertz_are_within_0_1_percent_and_the_load_gain
     }
 }
 
+// Under a constant load, without friction. Between samples the model predicts.
+TEST(LoadObserver, with_deadbeat_gains_three_samples_determine_angle_speed_and_load) {
+    constexpr double TORQUE_NM = 0.1, LOAD_NM = -0.2, FIRST_RAD_S = 1.5;
+    const observer_parameters_t p = configure(250.0, RATE_HZ, INERTIA_KG_M2, 0.0);
+    const double acceleration = (TORQUE_NM - LOAD_NM) / INERTIA_KG_M2;
+    for (const unsigned rate_hz : {100u, 250u, 1000u}) {
+        const load_observer_gains_t gains = load_observer_deadbeat_gains(rate_hz, to_fixed(INERTIA_KG_M2, Q30));
+        const int apart = int(RATE_HZ) / int(rate_hz);
+        const auto rev = [&](int k) {
+            const double t = k / RATE_HZ;
+            return 0.2 + (FIRST_RAD_S * t + 0.5 * acceleration * t * t) / (2.0 * PI);
+        };
+        load_observer_t observer;
+        load_observer_reset(&observer, angle_from_rev(rev(0)));
+        for (int k = 0; k <= 3 * apart; k++) {
+            const load_observer_gains_t none{};
+            const int32_t innovation = k % apart == 0 ? load_observer_innovation(&observer, angle_from_rev(rev(k))) : 0;
+            load_observer_step(&p.model, k % apart == 0 ? &gains : &none, &p.inertia, &observer, innovation,
+                               to_fixed(TORQUE_NM, Q24));
+        }
+        const double after_s = (3 * apart + 1) / RATE_HZ;
+        EXPECT_NEAR(rev_of(observer), rev(3 * apart + 1), 1e-7) << rate_hz;
+        EXPECT_NEAR(observer.speed_q22 / Q22, FIRST_RAD_S + acceleration * after_s, 1e-3) << rate_hz;
+        EXPECT_NEAR(observer.load_torque_q24 / Q24, LOAD_NM, 1e-3) << rate_hz;
+    }
+}
+
 TEST(LoadObserver, follows_its_reference_model_at_a_megahertz_with_an_ideal_encoder) {
     for (const double bandwidth : {250.0, 9000.0}) {
         const observer_parameters_t parameters = configure(bandwidth, 1e6);

@@ -122,6 +122,37 @@ class Machine {
     std::array<double, 2> lag{};
 };
 
+// By the equations of the header, for a machine with a unit of speed of 1 rad/s.
+TEST(Misalignment, parameters_are_those_of_the_rate_and_the_update_intervals) {
+    for (const int32_t rate_1_s : {8, 100}) {
+        for (const uint32_t rate_hz : {20000u, 40000u, 100000u}) {
+            const misalignment_settings_t settings = {.rate_1_s = rate_1_s,
+                                                      .control_rate_hz = rate_hz,
+                                                      .periods_per_update = 4,
+                                                      .periods_per_common_update = 16,
+                                                      .inertia_q30 = to_fixed(0.02, Q30),
+                                                      .phases = PHASES,
+                                                      .rotor_poles = 4,
+                                                      .encoder_bits = 17,
+                                                      .bandwidth_rad_s = 250,
+                                                      .speed_exponent = 0};
+            const misalignment_parameters_t p = misalignment_configure(&settings);
+            const double phase_s = 4.0 * PHASES / rate_hz, common_s = 16.0 / rate_hz;
+            const auto near = [&](const char *what, double got, double exact) {
+                EXPECT_NEAR(got, exact, 1.0 + 1e-3 * exact) << what << " " << rate_1_s << " " << rate_hz;
+            };
+            near("rate of a phase", p.rate_q30, rate_1_s * phase_s * Q30);
+            near("rate of the common angle", p.common_rate_q30, rate_1_s / 2.0 * common_s * Q30);
+            near("rate by the flux linkage", p.flux_rate_q8,
+                 rate_1_s / 2.0 * phase_s * Q40 / (2.0 * p.probe_angle) * Q8);
+            near("filter", p.filter_q32, 1.6 * phase_s * Q32);
+            near("mean", p.mean_q16, 10.0 * phase_s * Q16);
+            near("J / Ts", p.inertia_rate_q8, 0.02 * rate_hz * Q8);
+            near("settling", p.settle_updates, 0.150 / 4.0 * rate_hz);
+        }
+    }
+}
+
 TEST(Misalignment, that_of_every_phase_is_learned_to_0_02_degrees_in_1_5_s_as_by_the_reference_model) {
     for (const offsets_t &off : {offsets_t{0.2, 0.2, 0.2}, offsets_t{-0.3, 0.1, 0.2}, offsets_t{0.0, 0.5, 0.0}}) {
         Machine machine(12, off);

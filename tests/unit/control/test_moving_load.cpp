@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 #include <random>
+#include <utility>
 
 #include <gtest/gtest.h>
 
@@ -262,6 +263,28 @@ TEST(MovingLoad, a_trend_during_the_release_doubles_the_hold_up_to_0_8_s_and_a_q
     EXPECT_NEAR(detector.run(RATE_HZ, 0) * 1e3 / RATE_HZ, 65.0, 6.0);
 }
 
+TEST(MovingLoad, a_quiet_time_of_the_last_hold_and_then_of_each_half_of_it_halves_the_next_one) {
+    for (const auto &[quiet_s, next_ms] : {std::pair{0.9, 800.0}, {1.1, 800.0}, {1.3, 400.0}, {1.45, 200.0}}) {
+        Detector detector;
+        for (int repeat = 0; repeat < 8; repeat++) { // up to a hold of 0.8 s
+            while (detector.step(COUNT) < STAGES) {
+            }
+            while (detector.step(0) == STAGES) {
+            }
+        }
+        while (detector.step(0) > 0) {
+        }
+        detector.run(uint32_t(quiet_s * RATE_HZ), 0);
+        while (detector.step(COUNT) < STAGES) {
+        }
+        uint32_t periods = 0;
+        while (detector.step(0) == STAGES) {
+            periods++;
+        }
+        EXPECT_NEAR(periods * 1e3 / RATE_HZ, next_ms, 10.0) << quiet_s;
+    }
+}
+
 TEST(MovingLoad, hold_keeps_what_is_withheld_and_withholds_nothing_itself) {
     Detector moving;
     for (uint32_t k = 0; k < RATE_HZ; k++) {
@@ -320,6 +343,21 @@ TEST(MovingLoad, rounding_is_that_of_its_formula_for_any_encoder_and_rotation) {
         beats += most > 1.0 / 16.0;
     }
     EXPECT_GT(beats, 10000);
+}
+
+TEST(MovingLoad, rounding_is_that_of_a_rotation_of_up_to_11_samples_ago) {
+    const moving_load_settings_t of = settings();
+    const moving_load_parameters_t parameters = moving_load_configure(&of);
+    const uint32_t slow = uint32_t(0.01 * COUNT), fast = FAST;
+    ASSERT_GT(rounding_of(parameters, slow), 2 * rounding_of(parameters, fast));
+    moving_load_rounding_t rounding{};
+    for (int change = 0; change < 24; change++) { // at each of the six places
+        const uint32_t angle_step = change % 2 == 0 ? slow : fast;
+        for (int k = 0; k < 11 + change % 7; k++) {
+            moving_load_rounding_q4(&parameters, &rounding, angle_step);
+        }
+        EXPECT_EQ(rounding.rounding_q4, rounding_of(parameters, angle_step)) << change;
+    }
 }
 
 TEST(MovingLoad, the_trend_moves_by_its_exact_product_rounded_down) {

@@ -218,6 +218,18 @@ TEST(ObserverBandwidth,
     EXPECT_TRUE(bandwidth.step(2 * COUNT));
 }
 
+TEST(ObserverBandwidth, triggers_extend_the_holdoff_to_at_most_256_ms) {
+    for (const uint32_t rate_hz : {20000u, 40000u, 100000u}) {
+        Bandwidth bandwidth(configure(TRANSIENT_RAD_S, rate_hz), rate_hz);
+        for (int k = 0; k < 100; k++) {
+            bandwidth.state.trigger = OBSERVER_TRIGGER_IN_STEADY_STATE;
+            bandwidth.update(2 * COUNT, false);
+            EXPECT_LE(bandwidth.limits.holdoff_ticks * 1e3 / rate_hz, 256.0) << rate_hz;
+        }
+        EXPECT_GT(bandwidth.limits.holdoff_ticks * 1e3 / rate_hz, 255.0) << rate_hz;
+    }
+}
+
 TEST(ObserverBandwidth, a_trigger_counts_when_its_sample_and_the_next_ones_are_left_out_of_the_statistics) {
     Bandwidth bandwidth(configure());
     bandwidth.settle();
@@ -301,6 +313,9 @@ TEST(ObserverBandwidth, rare_edges_of_a_coarse_encoder_count_as_counts_and_frequ
     constexpr unsigned COARSE_BITS = 10;
     const observer_bandwidth_parameters_t p = configure(TRANSIENT_RAD_S, RATE_HZ, COARSE_BITS);
     const uint32_t count = 1u << (32 - COARSE_BITS);
+    ASSERT_LT(p.stage[STEADY_STAGE].bandwidth_rad_s, STEADY_RAD_S) << "a count would be worth too much torque";
+    EXPECT_GE(p.stage[p.schedule.steady_stage_edge].bandwidth_rad_s, STEADY_RAD_S) << "an edge is not";
+    EXPECT_LT(p.stage[p.schedule.steady_stage_edge].bandwidth_rad_s, STEADY_RAD_S * 16 / 13 * 16 / 13);
     for (const bool frequent : {false, true}) {
         Bandwidth bandwidth(p);
         bandwidth.angle_step = frequent ? count / 4 : count / 4 - 1; // one each 100 us

@@ -345,13 +345,49 @@ TEST(PeriodicLoad, without_a_bandwidth_or_beyond_a_delay_of_eight_values_nothing
     EXPECT_EQ(state.torque_q24, 0);
 }
 
+// The angle jumps by a third of a turn: values of before are no neighbours of those after it.
+TEST(PeriodicLoad, the_mean_over_a_pole_pitch_begins_anew_where_the_angle_jumps) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    const int32_t angle_step = int32_t(REV * 150.0 / 60.0 / RATE_HZ);
+    periodic_load_t load{};
+    uint32_t angle = 0;
+    const auto turn = [&](double turns) {
+        for (int k = 0; k < int(turns * REV / angle_step); k++, angle += uint32_t(angle_step)) {
+            const periodic_load_sample_t sample = {.angle = angle,
+                                                   .angle_step = angle_step,
+                                                   .load_torque_q24 = to_fixed(harmonics(0.0, angle / REV), Q24),
+                                                   .moving = false};
+            periodic_load_step(&parameters, &load, &sample);
+        }
+        int32_t sum_q8 = 0;
+        for (int value = 1; value <= PITCH; value++) {
+            sum_q8 += load.estimate_q8[(load.index - uint32_t(value)) % VALUES];
+        }
+        return sum_q8;
+    };
+    EXPECT_EQ(turn(1.5), load.window_q8);
+    angle += 1u << 30;
+    EXPECT_EQ(turn(0.7), load.window_q8);
+    EXPECT_EQ(load.window, unsigned(PITCH));
+    EXPECT_NE(load.window_q8, 0);
+}
+
+TEST(PeriodicLoad, the_window_of_a_pole_pitch_is_the_nearest_number_of_values) {
+    for (unsigned poles = 1; poles <= 64; poles++) {
+        const periodic_load_parameters_t parameters =
+            periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), poles);
+        EXPECT_NEAR(parameters.pitch, double(VALUES) / poles, 0.5) << poles;
+    }
+}
+
 TEST(PeriodicLoad, values_are_the_means_of_their_intervals_rounded_towards_zero_and_the_torque_is_between_them) {
     const periodic_load_parameters_t parameters =
         periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
     periodic_load_t load{};
     const int32_t angle_step = int32_t(REV * 150.0 / 60.0 / RATE_HZ);
     uint32_t angle = 12345, random = 1;
-    int index = -1, sum_q8 = 0, updates = 0, compared = 0;
+    int index = -1, sum_q8 = 0, updates = 0, ended_values = 0, cleared = 0, kept = 0;
     for (int k = 0; k < 3 * int(REV / angle_step); k++, angle += uint32_t(angle_step)) {
         const int now = int((angle - uint32_t(angle_step * parameters.lag_periods)) >> 26);
         const int mean_q8 = updates > 0 ? sum_q8 / updates : 0;
@@ -366,14 +402,17 @@ TEST(PeriodicLoad, values_are_the_means_of_their_intervals_rounded_towards_zero_
         updates++;
         const periodic_load_sample_t sample = {
             .angle = angle, .angle_step = angle_step, .load_torque_q24 = load_q24, .moving = false};
-        const int profile_q8 = load.mode == PERIODIC_LOAD_CLEAR || ended < 0 ? 0 : load.profile_q8[ended];
+        const bool clear = load.mode == PERIODIC_LOAD_CLEAR;
+        const int profile_q8 = clear || ended < 0 ? 0 : load.profile_q8[ended];
         periodic_load_step(&parameters, &load, &sample);
-        if (updates == 1 && ended >= 0 && k > int(REV / angle_step)) {
+        if (updates == 1 && ended >= 0 && ++ended_values > 1) { // the first one has begun in its interval
             ASSERT_EQ(load.estimate_q8[ended], mean_q8 + profile_q8) << k;
-            compared++;
+            cleared += clear;
+            kept += !clear;
         }
     }
-    EXPECT_GT(compared, VALUES / 2);
+    EXPECT_GT(cleared, VALUES / 2);
+    EXPECT_GT(kept, VALUES / 2);
     // Interpolation: exact in Q24.
     load.mode = PERIODIC_LOAD_KEEP;
     for (int value = 0; value < VALUES; value++) {

@@ -644,6 +644,8 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
         p.conduction.single_pulse = i % 2 == 0;
         int32_t current_q9[HAL_PHASES_MAX], flux[HAL_PHASES_MAX], misalignment[HAL_PHASES_MAX];
         int32_t duty_q15[HAL_PHASES_MAX];
+        static_assert(PHASES < HAL_PHASES_MAX);
+        duty_q15[PHASES] = 123;
         for (int k = 0; k < 4; k++) {
             for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
                 current_q9[phase] = int32_t(random() % 40951);
@@ -677,6 +679,7 @@ TEST(PredictiveTorque, any_sample_gives_duties_within_one_and_overflows_nothing)
                 .flux_observer = &p.flux,
                 .period_q40 = p.period_q40};
             predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
+            ASSERT_EQ(duty_q15[PHASES], 123) << "no phase of the machine";
             for (unsigned phase = 0; phase < PHASES; phase++) {
                 ASSERT_GE(duty_q15[phase], -32768);
                 ASSERT_LE(duty_q15[phase], DUTY_MAX_Q15);
@@ -707,6 +710,9 @@ TEST(PredictiveTorque, what_a_lost_phase_would_make_is_missing_in_both_direction
                 predictive_torque_step(&p, &control, &machine_tables, &sample, duty_q15);
             }
             EXPECT_NEAR(control.torque_shortfall_q24 / Q24, lost == 1 ? reference_Nm : 0.0, 0.2) << lost;
+            if (lost != 0) {
+                EXPECT_EQ(duty_q15[lost - 1], -32768) << "both switches of it are off";
+            }
         }
     }
 }

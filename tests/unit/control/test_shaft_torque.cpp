@@ -58,6 +58,19 @@ TEST_F(ShaftTorque, is_the_missing_factor_less_its_tolerance) {
     }
 }
 
+// Sums of more than 30 bits.
+TEST_F(ShaftTorque, is_the_missing_factor_of_a_drive_of_100_Nm) {
+    parameters.variance_min_q14 = to_fixed(100.0 / 8.0 * 100.0 / 8.0, Q14);
+    for (const double gain : {0.95, 1.0, 1.06}) {
+        state = {};
+        sample.scale_q30 = to_fixed(gain, Q30);
+        windows(800, 1.0, 1.0, 250.0);
+        ASSERT_GT(state.variance, 1 << 30);
+        const double missing = 1.0 / gain - 1.0;
+        EXPECT_NEAR(factor(), gain == 1.0 ? 1.0 : 1.0 + missing - std::copysign(1.0 / 80.0, missing), 2e-4) << gain;
+    }
+}
+
 TEST_F(ShaftTorque, is_1_for_another_inertia) {
     for (const double ratio : {0.5, 0.9, 1.1, 2.0}) {
         state = {};

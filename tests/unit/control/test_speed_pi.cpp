@@ -101,6 +101,15 @@ TEST(SpeedPi, the_integral_is_clamped_to_the_limits) {
     EXPECT_EQ(torque_q24, -(3 << 24));
 }
 
+TEST(SpeedPi, a_limit_that_comes_nearer_clamps_the_integral_also_without_an_error) {
+    for (const int sign : {1, -1}) {
+        const speed_pi_parameters_t parameters = parameters_of(1.0, 400.0, -5.0, 5.0);
+        speed_pi_t pi{sign * (int64_t(20) << 54)};
+        EXPECT_EQ(speed_pi_step(&parameters, &pi, 0), sign * (5 << 24));
+        EXPECT_EQ(pi.integral_q54, sign * (int64_t(5) << 54));
+    }
+}
+
 TEST(SpeedPi, lowering_a_limit_clamps_the_integral) {
     speed_pi_parameters_t parameters = parameters_of(1.0, 400.0, 0.0, 20.0);
     speed_pi_t pi{int64_t(20) << 54};

@@ -199,6 +199,26 @@ TEST_F(TableScale, leaves_tables_that_are_right_as_they_are) {
     EXPECT_NEAR(in_effect(0.965), 0.965, 0.002);
 }
 
+// The gain of the machine moves slowly away from 1 and back, to each side.
+TEST_F(TableScale, differs_from_a_40th_on_until_it_is_within_an_80th) {
+    for (const double side : {1.0, -1.0}) {
+        table_scale_reset(&state);
+        double last_off = 0.0, begins = 0.0, ends = 0.0;
+        for (int k = 0; k <= 800; k++) {
+            const bool before = state.differs;
+            flux_gain = 1.0 + side * 0.04 * std::min(k, 800 - k) / 400.0;
+            interval();
+            const double off = std::fabs(scale() - 1.0);
+            if (state.differs != before) {
+                (state.differs ? begins : ends) = (off + last_off) / 2.0;
+            }
+            last_off = off;
+        }
+        EXPECT_NEAR(begins, 1.0 / 40.0, 1e-4) << side;
+        EXPECT_NEAR(ends, 1.0 / 80.0, 1e-4) << side;
+    }
+}
+
 TEST_F(TableScale, is_limited) {
     flux_gain = 2.0;
     intervals(14);

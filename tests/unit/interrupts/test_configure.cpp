@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <iterator>
 #include <random>
 #include <string>
 
@@ -15,6 +16,7 @@ extern "C" {
 #include "interrupts/deferred.h"
 }
 
+#include "support/configured.h"
 #include "support/reference_models.h"
 
 namespace {
@@ -303,6 +305,42 @@ TEST(Configure, converts_random_sets_of_parameters_within_their_ranges) {
         SCOPED_TRACE(testing::Message() << "set " << i);
         ASSERT_NO_FATAL_FAILURE(expect_converted(parameters, RATES_HZ[random() % 5], unsigned(8 + random() % 25),
                                                  TIMER_CLOCKS_HZ[random() % 4]));
+    }
+}
+
+TEST(Configure, single_pulses_take_overlapping_windows_without_a_torque_reserve) {
+    for (const bool sharing : {false, true}) {
+        for (const int32_t reserve_q24 : {0, 1 << 24}) {
+            const control_parameters_t c =
+                configured(DRIVE_CONTROLLER_SALIENT, 40000, 17, 12,
+                           {{PARAMETER_TORQUE_SHARING, sharing}, {PARAMETER_TORQUE_RESERVE_NM, reserve_q24}});
+            EXPECT_EQ(c.conduction.single_pulse, sharing && reserve_q24 == 0) << sharing << " " << reserve_q24;
+        }
+    }
+}
+
+TEST(Configure, a_gain_of_the_pid_of_0_is_none) {
+    const parameter_index_t gains[] = {PARAMETER_BP_KP_MAX, PARAMETER_BP_KI_MAX, PARAMETER_BP_KD_MAX};
+    for (unsigned off = 0; off < std::size(gains); off++) {
+        const control_parameters_t c = configured(DRIVE_CONTROLLER_PAPER, 40000, 17, 12, {{gains[off], 0}});
+        for (unsigned k = 0; k < std::size(gains); k++) {
+            EXPECT_EQ(c.duty.pid.scale_q28[k] == 0, k == off) << off << " " << k;
+        }
+    }
+}
+
+TEST(Configure, the_gains_of_duty_control_refer_to_the_middle_between_turn_on_and_turn_off) {
+    for (const auto &[on_deg, off_deg] : {std::pair{185, 305}, {200, 320}}) {
+        const control_parameters_t c =
+            configured(DRIVE_CONTROLLER_PAPER, 40000, 17, 12,
+                       {{PARAMETER_TURN_ON_ANGLE_DEG, on_deg << 7}, {PARAMETER_TURN_OFF_ANGLE_DEG, off_deg << 7}});
+        const auto slope_at = [&](int32_t twice_deg) {
+            pwm_ditc_parameters_t at = c.duty;
+            pwm_ditc_set_reference_point(&at, &machine_tables, commutation_angle_from_degrees(twice_deg << 6), 1 << 20);
+            return at.torque_per_flux_q16;
+        };
+        EXPECT_EQ(c.duty.torque_per_flux_q16, slope_at(on_deg + off_deg)) << on_deg;
+        EXPECT_NE(c.duty.torque_per_flux_q16, slope_at(on_deg + off_deg - 4)) << on_deg;
     }
 }
 

@@ -158,6 +158,14 @@ TEST_F(Control, counts_of_every_resolution_become_the_nearest_current_and_voltag
     }
 }
 
+// Before the first results, as a first step that is late leaves them.
+TEST_F(Control, a_reset_observes_with_the_inertia_of_the_parameters) {
+    const load_observer_inertia_t expected = load_observer_inertia(&parameters.observer, 0);
+    EXPECT_GT(expected.acceleration_q32, 0);
+    EXPECT_EQ(deferred_in_effect(&state)->observer.acceleration_q32, expected.acceleration_q32);
+    EXPECT_EQ(deferred_in_effect(&state)->observer.load_shift, expected.load_shift);
+}
+
 TEST_F(Control, initialise_lasts_a_millisecond) {
     for (int k = 0; k < 39; k++) {
         step(COMMAND_OFF);

@@ -8,6 +8,7 @@
 extern "C" {
 #include "interrupts/deferred.h"
 #include "interrupts/observe.h"
+#include "interrupts/torque_control.h"
 #include "storage/fault.h"
 }
 
@@ -537,6 +538,104 @@ TEST_F(Deferred, the_inertia_is_identified_from_the_mean_torque_since_its_last_u
     }
 }
 
+TEST_F(Deferred, a_torque_at_its_limit_in_either_direction_while_the_speed_changes_is_a_transient) {
+    start();
+    const int32_t max_q24 = state.deferred.conduction.torque_max_q24,
+                  min_q24 = state.deferred.conduction.torque_min_q24;
+    ASSERT_LT(min_q24, 0);
+    for (const int32_t torque_q24 : {max_q24, max_q24 - (1 << 16), 0, min_q24 + (1 << 16), min_q24}) {
+        state.deferred.inertia.transient_windows = 0;
+        for (int k = 0; k < 2 * DEFERRED_COMMON_PERIODS; k++) {
+            interrupt(COMMAND_RUN);
+            state.deferred_request.input.torque_reference_q24 = torque_q24;
+            deferred_step(&parameters, &state, &command);
+        }
+        ASSERT_TRUE(state.deferred.approaches_reference);
+        const bool limited = torque_q24 == max_q24 || torque_q24 == min_q24;
+        EXPECT_EQ(state.deferred.inertia.transient_windows > 0, limited) << torque_q24;
+    }
+}
+
+TEST_F(Deferred, a_reference_is_approached_until_the_speed_has_been_within_a_16th_with_a_torque_below_its_limit) {
+    parameters.speed_ramp_q22 = INT32_MAX;
+    start();
+    double reference_rpm = 600.0;
+    const int32_t limit_q24 = state.deferred.conduction.torque_max_q24;
+    for (const double off : {1.0 / 20.0, 1.0 / 12.0}) {
+        for (const bool limited : {false, true}) {
+            reference_rpm += 100.0;
+            const double speed_rpm = reference_rpm * (1.0 - off);
+            for (int k = 0; k < 2000; k++) {
+                interrupt(COMMAND_RUN, reference_rpm);
+                deferred_input_t &input = state.deferred_request.input;
+                input.speed_q22 = fixed_point::to_fixed(fixed_point::rad_s(speed_rpm), fixed_point::Q22);
+                input.torque_reference_q24 = limited ? limit_q24 : limit_q24 / 2;
+                deferred_step(&parameters, &state, &command);
+            }
+            EXPECT_EQ(state.deferred.approaches_reference, limited || off > 1.0 / 16.0) << off << " " << limited;
+        }
+    }
+}
+
+TEST_F(Deferred, a_periodic_load_is_learned_in_turns_in_which_the_load_moves_and_is_not_constant_over_the_strokes) {
+    speed_rad_s = 20.0;
+    start();
+    for (const bool moving : {false, true}) {
+        for (const bool constant : {false, true}) {
+            state.deferred.periodic_load.moved = false;
+            for (int k = 0; k < DEFERRED_COMMON_PERIODS; k++) {
+                state.deferred.moving_load.withheld = moving ? 3 : 0;
+                state.deferred.moving_load.ticks = 1000;
+                state.deferred.stroke_mean.remaining = constant ? 0 : 1000;
+                period(COMMAND_RUN);
+            }
+            EXPECT_EQ(state.deferred.load_constant, constant);
+            EXPECT_EQ(state.deferred.periodic_load.moved, moving && !constant) << moving << constant;
+        }
+    }
+}
+
+TEST_F(Deferred, a_run_on_a_rotor_that_turns_backwards_begins_with_the_limit_of_generating_phases) {
+    configure(DRIVE_CONTROLLER_TRADITIONAL);
+    speed_rad_s = -40.0;
+    for (int k = 0; k < 4000; k++) {
+        period(COMMAND_OFF);
+    }
+    ASSERT_EQ(state.state_machine.state, DRIVE_STATE_READY);
+    const ditc_hysteresis_limit_t generating = torque_control_limit(&parameters, state.observer.speed_q22);
+    ASSERT_LT(generating.current_q9, parameters.hysteresis.current_limit_q9);
+    ASSERT_TRUE(interrupt(COMMAND_RUN));
+    EXPECT_NEAR(results().limit.current_q9, generating.current_q9, 5);
+    EXPECT_EQ(results().limit.state, generating.state);
+}
+
+TEST_F(Deferred, the_network_of_the_pid_begins_anew_with_each_run) {
+    configure(DRIVE_CONTROLLER_PAPER);
+    bp_tuner_t initial{};
+    bp_tuner_reset(&parameters.duty.pid, &initial);
+    bp_neuron_t *neurons = state.deferred.tuner.network.hidden;
+    for (int run = 0; run < 2; run++) {
+        for (int k = 0; k < 41; k++) {
+            period(COMMAND_OFF);
+        }
+        ASSERT_TRUE(interrupt(COMMAND_RUN));
+        for (int i = 0; i < BP_HIDDEN; i++) {
+            for (int j = 0; j < 3; j++) {
+                ASSERT_EQ(neurons[i].input.value[j], initial.network.hidden[i].input.value[j]) << run;
+                ASSERT_EQ(neurons[i].output.value[j], initial.network.hidden[i].output.value[j]) << run;
+                ASSERT_EQ(neurons[i].output.increment[j], 0) << run;
+            }
+        }
+        deferred_step(&parameters, &state, &command);
+        for (int i = 0; i < BP_HIDDEN; i++) { // learned
+            neurons[i].input.value[0] += 1 << 20;
+            neurons[i].output.value[0] -= 1 << 20;
+            neurons[i].output.increment[0] = 1 << 10;
+        }
+        period(COMMAND_RUN);
+    }
+}
+
 TEST_F(Deferred, tuned_parameters_are_in_effect_at_once_with_the_identified_inertia) {
     start();
     state.deferred.inertia.shift = -1;
@@ -559,6 +658,23 @@ TEST_F(Deferred, counts_of_an_encoder_of_13_bits_are_never_slow) {
             period(COMMAND_RUN);
         }
         EXPECT_EQ(results().slow_counts.slow, slow) << bits;
+    }
+}
+
+TEST_F(Deferred, while_counts_are_slow_a_load_limits_the_braking_torque_of_speed_mode_and_nothing_in_torque_mode) {
+    parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), 12).slow_counts;
+    start();
+    for (const bool torque_mode : {false, true}) {
+        command.mode = torque_mode ? DRIVE_MODE_TORQUE : DRIVE_MODE_SPEED;
+        command.torque_reference_q24 = -(2 << 24);
+        for (unsigned k = 0; k < RATE_HZ / 10; k++) {
+            interrupt(COMMAND_RUN);
+            state.deferred_request.input.load_torque_q24 = 3 << 24; // more than a sixteenth of the largest torque
+            deferred_step(&parameters, &state, &command);
+        }
+        ASSERT_TRUE(results().slow_counts.slow);
+        EXPECT_EQ(results().speed.torque_min_q24, torque_mode ? -(2 << 24) : 0);
+        EXPECT_EQ(results().speed.torque_max_q24, torque_mode ? -(2 << 24) : state.deferred.conduction.torque_max_q24);
     }
 }
 

@@ -113,7 +113,10 @@ TEST_F(Measure, torque_is_that_of_the_tables_at_the_angle_of_each_phase_and_0_wh
             sample.adc.phase_current_counts[phase] = phase == k % 3 ? 0 : uint16_t(500 + 300 * phase);
         }
         step();
+        state.measurement.current_q9[machine_tables.phases] = 15 << 9; // no phase
+        state.measurement.torque[machine_tables.phases] = 99;
         measure_torque(&parameters, &state, misalignment, false);
+        EXPECT_EQ(state.measurement.torque[machine_tables.phases], 99);
         int32_t sum = 0;
         for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
             const uint32_t angle = commutation_angle(&parameters.commutation, &state.measurement.commutation, phase);

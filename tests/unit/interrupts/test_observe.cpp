@@ -43,6 +43,7 @@ class Observe : public testing::Test {
 
 TEST_F(Observe, an_observer_that_slips_begins_again_at_the_encoders_angle_and_its_speed_in_half_a_millisecond) {
     for (const uint32_t periods_per_ms : {20u, 40u, 100u, 1000u}) {
+        machine_tables.speed_exponent = periods_per_ms == 100 ? 3 : 0; // a machine with a unit of speed of 8 rad/s
         for (const int32_t innovation : {LIMIT_LOW, LIMIT_HIGH}) {
             for (const int32_t rotation : {-100000000, -999000, 1000000, 134217000}) { // in half a millisecond
                 reset();
@@ -93,6 +94,21 @@ TEST_F(Observe, a_cleared_load_starts_at_the_maximum_bandwidth_with_angle_and_sp
     EXPECT_EQ(state.observer.speed_q22, 123);
     EXPECT_EQ(state.bandwidth.stage, 0u);
     EXPECT_EQ(state.deferred_request.generation, before + DEFERRED_OBSERVER_STEP);
+}
+
+TEST_F(Observe, the_innovation_is_noted_for_the_deferred_step_as_the_observer_sees_it) {
+    for (const bool slow : {false, true}) {
+        for (const int32_t ahead : {-1000, 0, 1 << 20, 1 << 30}) {
+            reset();
+            deferred_results_t results{};
+            results.observer = load_observer_inertia(&parameters.observer, 0);
+            results.slow_counts.slow = slow;
+            state.measurement.angle = uint32_t(ahead);
+            state.innovation = 99;
+            observe(&parameters, &state, &results);
+            EXPECT_EQ(state.innovation, std::min(ahead, LIMIT_HIGH)) << slow;
+        }
+    }
 }
 
 TEST_F(Observe, a_count_that_does_not_change_limits_the_speed_in_both_directions_and_one_that_does_not) {

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include <gtest/gtest.h>
 
@@ -277,15 +278,45 @@ TEST_F(AngleEvidence, a_phase_has_company_while_another_has_contradicted_the_ang
 TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
     // By the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.
-    for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{0.05, true}}) {
+    const struct {
+        double part;
+        int begins;
+        bool frozen;
+    } cases[] = {{0.9, 50, false}, {0.05, 50, true}, {0.12, 1, false}, {0.05, 1, true}};
+    for (const auto &[part, begins, frozen] : cases) {
         monitor = {};
         double excess_Wb = 0.0;
         for (int k = 0; k < 400; k++) {
-            excess_Wb += k < 50 || excess_Wb > 0.1 ? 0.0 : part * 240.0 * PERIOD_S;
+            excess_Wb += k < begins || excess_Wb > 0.1 ? 0.0 : part * 240.0 * PERIOD_S;
             flux_offset_q29 = to_fixed(excess_Wb, Q29);
             step(75.0, 75.0, 25.0);
         }
+        EXPECT_EQ(monitor.frozen, frozen) << part << " " << begins;
+    }
+}
+
+// At nine tenths of the tolerated error of the voltage, for longer than the time constant of the leak.
+TEST_F(AngleEvidence, an_integral_that_drifts_by_less_than_the_tolerated_error_for_long_is_no_frozen_encoder) {
+    for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{-0.9, false}, std::pair{2.0, true}}) {
+        monitor = {};
+        for (int k = 0; k < RATE_HZ / 40; k++) {
+            flux_offset_q29 = int32_t(part * k * parameters.flux_error_q29);
+            step(75.0, 75.0, 25.0);
+        }
         EXPECT_EQ(monitor.frozen, frozen) << part;
+    }
+}
+
+TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_frozen_encoder) {
+    for (const bool jumps : {true, false}) {
+        monitor = {};
+        for (int k = 0; k < 400; k++) {
+            const double current_A = std::clamp(25.0 - 0.1 * (k - 50), 13.0, 25.0);
+            const double excess_Wb = k < 170 ? 0.0 : std::min(0.03, 0.05 * 240.0 * PERIOD_S * (jumps ? 1e3 : k - 170));
+            flux_offset_q29 = to_fixed(excess_Wb, Q29);
+            step(75.0, 75.0, current_A);
+        }
+        EXPECT_EQ(monitor.frozen, !jumps);
     }
 }
 
@@ -360,6 +391,21 @@ TEST_F(AngleEvidence, an_agreement_speaks_for_the_encoder_for_a_quarter_of_a_sec
         }
         EXPECT_EQ(monitor.angle, one.fails) << one.since_s << " " << one.in_run;
     }
+}
+
+TEST_F(AngleEvidence, the_end_of_a_run_changes_nothing_beyond_the_last_phase) {
+    struct {
+        angle_evidence_t state;
+        angle_evidence_phase_t beyond;
+    } memory{};
+    std::memset(&memory, 1, sizeof memory); // each bool of it is true
+    flux_residual_t residual{};
+    residual.phases = phases;
+    flux_evidence_t evidence{};
+    angle_evidence_step(&parameters, &memory.state, &residual, &evidence);
+    EXPECT_FALSE(memory.state.phase[HAL_PHASES_MAX - 1].agreed);
+    EXPECT_TRUE(memory.beyond.agreed);
+    EXPECT_TRUE(memory.state.advanced);
 }
 
 TEST_F(AngleEvidence, a_contradiction_of_the_run_before_is_no_company_of_a_faulty_phase) {

@@ -73,6 +73,20 @@ TEST_F(EncoderMonitor,
     }
 }
 
+TEST_F(EncoderMonitor, an_encoder_that_turns_the_other_way_after_triggers_were_lost_has_not_turned_round) {
+    for (const bool lost : {true, false}) {
+        monitor = {};
+        double angle_deg = 0.0; // 300 r/min one way, then the other
+        for (int k = 0; k < 20 * RATE_HZ / 1000; k++) {
+            const int turns = 10 * RATE_HZ / 1000;
+            angle_deg += (k < turns ? 1800.0 : -1800.0) / RATE_HZ;
+            residual.lost = k == turns && lost;
+            step(angle_deg);
+        }
+        EXPECT_EQ(monitor.turned_round, !lost);
+    }
+}
+
 TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_turn_round) {
     monitor = {};
     input.periods = 0;

@@ -57,11 +57,14 @@ class PhaseBalance : public testing::Test {
 };
 
 TEST_F(PhaseBalance, a_phase_beyond_four_thirds_or_three_quarters_of_all_others_has_a_wrong_sensor) {
-    for (const double wrong : {1.36, 0.73}) {
-        ratio[1] = wrong;
-        EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR)) << wrong;
-        EXPECT_EQ(balance.unbalanced, 2u);
-        balance = {};
+    for (unsigned phase = 0; phase < 3; phase++) {
+        for (const double wrong : {1.36, 0.73}) {
+            ratio[phase] = wrong;
+            EXPECT_EQ(window(), FAULT_BIT(FAULT_CURRENT_SENSOR)) << phase << " " << wrong;
+            EXPECT_EQ(balance.unbalanced, 1u << phase);
+            balance = {};
+        }
+        ratio[phase] = 1.0;
     }
 }
 

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
+#include <utility>
 
 extern "C" {
 #include "monitors/flux_monitor.h"
@@ -173,18 +174,61 @@ TEST_F(PhaseEvidence, current_of_a_phase_that_is_read_in_another_is_the_sensors)
     EXPECT_EQ(monitor.phases, 3u);
 }
 
+// The current of phase 0 ends at once, or does not begin although there is voltage; phase 1, which is off, has one.
+TEST_F(PhaseEvidence, a_current_that_ends_or_does_not_begin_is_the_sensors_when_another_phase_has_one_that_moves) {
+    input.electrical = MIDDLE;
+    for (const bool ends : {true, false}) {
+        monitor = {};
+        const int periods = periods_to_fault(100, [&](int k) {
+            input.current_q9[1] = k < 20 ? 0 : (10 + k - 20) * 512;
+            if (ends && k < 20) {
+                set(0, 10.0, table_Wb(10.0));
+            } else if (ends) {
+                set(0, 0.0, k == 20 ? table_Wb(10.0) : 0.0);
+                input.off[0] = true;
+            } else {
+                set(0, 0.0, k < 20 ? 0.0 : 8e-3); // within the drop of the devices
+            }
+        });
+        EXPECT_GT(periods, 20) << ends;
+        EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR)) << ends;
+        EXPECT_EQ(monitor.phases, 3u) << ends;
+    }
+}
+
+// Both switches open at the aligned position: parts of what the voltage removes, less its tolerance for delays.
+TEST_F(PhaseEvidence, a_current_that_falls_by_less_than_a_quarter_of_what_the_voltage_removes_is_a_shorted_phase) {
+    for (const double part : {0.1, 0.21, 0.26, 0.5}) {
+        monitor = {};
+        input.electrical = 0;
+        const double flux_Wb = table_Wb(20.0);
+        periods_to_fault(80, [&](int k) {
+            const double removed = std::clamp((k - 20) / 50.0, 0.0, 0.7);
+            const double seen_Wb = flux_Wb * (1.0 - part * removed);
+            double current_A = 20.0;
+            while (table_Wb(current_A) > seen_Wb) {
+                current_A -= 0.01;
+            }
+            set(0, current_A, flux_Wb * (1.0 - removed));
+            input.off[0] = k >= 20;
+        });
+        EXPECT_EQ(failed, part < 0.25 ? FAULT_BIT(FAULT_PHASE_SHORTED) : 0u) << part;
+    }
+}
+
 // Differences that an angle explains: `differ` of three phases, of which `conduct` conduct in turn, over more than four
 // electrical revolutions.
 class PhaseEvidenceInTurn : public PhaseEvidence {
   protected:
-    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution, int until = 1100) {
-        return periods_to_fault(1100, [&](int k) {
+    int periods_with(unsigned differ, unsigned conduct, int step_of_revolution, int until = 1100, int each = 1) {
+        return periods_to_fault(1100 + 250 * (each - 1), [&](int k) {
             input.electrical += uint32_t(step_of_revolution * (1 << 24)); // 256 periods in a revolution
             for (unsigned phase = 0; phase < conduct; phase++) {
                 const uint32_t angle = input.electrical - phase * input.stroke;
                 const bool conducts = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;
                 const double flux_Wb = phase_map_results::flux_q29(machine_tables, angle, 10 * 512) / Q29;
-                set(phase, conducts ? 10.0 : 0.0, conducts ? (phase < differ && k < until ? 1.8 : 1.0) * flux_Wb : 0.0);
+                set(phase, conducts ? 10.0 : 0.0,
+                    conducts ? (phase < differ && k < until && k / 256 % each == 0 ? 1.8 : 1.0) * flux_Wb : 0.0);
                 input.off[phase] = !conducts;
             }
         });
@@ -206,6 +250,13 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_its_first_stroke_only_is_n
         monitor = {};
         EXPECT_EQ(periods_with(1, 3, direction, 256), -1) << direction;
         EXPECT_EQ(monitor.phases_by_current.doubted, 0u) << direction;
+    }
+}
+
+TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_each_second_stroke_only_is_none) {
+    for (const int direction : {1, -1}) {
+        monitor = {};
+        EXPECT_EQ(periods_with(1, 3, direction, 2200, 2), -1) << direction;
     }
 }
 
@@ -238,12 +289,14 @@ TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
 
 // Phase b differs, c conducts at every angle, so that it agrees in each sample; a conducts in its turn or not at all.
 TEST_F(PhaseEvidence, one_phase_that_differs_for_long_is_none_until_each_of_the_others_has_agreed) {
-    for (unsigned a = 0; a < 3; a++) {
+    // 20 ms end between two strokes of b, or in one.
+    for (const auto &[a, in_a_revolution] :
+         {std::pair{0u, 256.0}, {1u, 256.0}, {2u, 256.0}, {0u, 264.0}, {1u, 264.0}, {2u, 264.0}}) {
         for (const bool conducts_too : {false, true}) {
             monitor = {};
             const unsigned b = (a + 1) % 3;
             const int periods = periods_to_fault(2000, [&](int) {
-                input.electrical += 1u << 24; // 256 periods in a revolution
+                input.electrical += uint32_t(0x1p32 / in_a_revolution);
                 for (unsigned phase = 0; phase < 3; phase++) {
                     const uint32_t angle = input.electrical - phase * input.stroke;
                     const bool in_turn = angle >= MIDDLE - (1u << 29) && angle < MIDDLE;

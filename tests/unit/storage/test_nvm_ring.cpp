@@ -60,6 +60,18 @@ class NvmRing : public testing::Test {
     nvm_ring_t ring{};
 };
 
+// A program reads what an earlier one has written: the header has its places for good.
+TEST_F(NvmRing, a_header_is_magic_layout_version_length_and_sequence_number) {
+    for (uint32_t sequence = 1; sequence <= 3; sequence++) {
+        write(sequence);
+        const uint64_t header = word(sequence - 1, 0);
+        EXPECT_EQ(header >> 48, 0x5344u);
+        EXPECT_EQ(header >> 40 & 0xffu, 1u);
+        EXPECT_EQ(header >> 32 & 0xffu, RECORD_WORDS);
+        EXPECT_EQ(header & UINT32_MAX, sequence);
+    }
+}
+
 TEST_F(NvmRing, an_erased_memory_has_no_record_and_no_damage) {
     EXPECT_EQ(ring.sequence, 0u);
     EXPECT_FALSE(ring.damaged);
