@@ -99,6 +99,8 @@ METRICS = {
     "copper_to_least": Metric("sum of squares of the currents", "of the least without ripple", 3, 0.003),
     "torque_fast_Nm": Metric("mean torque at 1.5 times the base speed", "N m", 3, 0.01),
     "torque_error_fast_percent": Metric("error of the mean torque at 1.5 times the base speed", "%", 2, 0.1),
+    "torque_error_2s_percent": Metric("error of the mean torque after 2 s", "%", 2, 0.1),
+    "torque_error_fast_2s_percent": Metric("error of the mean torque at 1.5 times the base speed after 2 s", "%", 2, 0.1),
     "ripple_to_right": Metric("K_t over 0.1 s", "of the right file's", 2, 0.05),
     "ripple_step_to_right": Metric("K_t from 20 ms after a load step", "of the right file's", 2, 0.05),
     "dip_to_right": Metric("speed drop", "of the right file's", 2, 0.02),
