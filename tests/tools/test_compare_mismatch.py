@@ -38,7 +38,7 @@ def compare(*line):
 
 
 def magnetics(folder: Path, machine: str, fault: Fault):
-    """Of the right and of the wrong file, and angles from aligned to unaligned."""
+    """Magnetics of the right and of the wrong file, and angles from aligned to unaligned."""
     path = wrong_file(machine_path(machine), fault, "some error", folder)
     right, wrong = load_machine(machine_path(machine)).magnetics, load_machine(path).magnetics
     assert wrong.form == right.form
@@ -162,8 +162,8 @@ def step_case(condition: str, machine: str, true_machine: str | None) -> Case:
 
 def test_drop_is_that_of_the_motor_whatever_the_file_says(tmp_path):
     """Before the torque follows, the speed falls by load over inertia of the motor. A drive whose file has half of the
-    motor's inertia takes the load for half, and loses most of what the heavier rotor gains; one whose file has twice the
-    motor's drops further."""
+    motor's inertia takes the load for half, and loses most of what the heavier rotor gains; with twice the motor's in
+    its file the drop is larger."""
     file = str(wrong_file(machine_path("saturating"), Fault(inertia=2.0), "inertia x 2", tmp_path))
     names = ("saturating, right file", "saturating, motor", "saturating, file")
     pairs = (("saturating", None), ("saturating", file), (file, "saturating"))
@@ -208,7 +208,8 @@ def test_ratio_is_to_the_condition_that_a_run_is_relative_to():
     failed = [RunMetrics(case, {}, "fault stall"), runs[1]]
     assert "ripple_step_to_right" not in _with_ratios(failed)[1].metrics
     rows = {row.key[1:3]: row for row in table.make_rows(_with_ratios(runs))}
-    assert rows["saturating, a", "ripple_step_to_right"].label == "K_t from 20 ms after a load step, of the right file's"
+    (row,) = (row for key, row in rows.items() if key == ("saturating, a", "ripple_step_to_right"))
+    assert row.label == "K_t from 20 ms after a load step, of the right file's" and row.values == {"salient": 2.0}
 
 
 def test_true_machine_of_the_user_is_refused():

@@ -1,5 +1,6 @@
-"""What a wrong machine file costs: the drive on a file with one stated error (wrong_files.py), the motor of the right
-one. Speeds and loads are those of the right machine, and each figure is beside that of the drive on the right file.
+"""Cost of a wrong machine file: the drive on one with a stated error (wrong_files.py), the motor of the right one.
+
+Speeds and loads are those of the right machine, and each figure is beside that of the drive on the right file.
 
 A displaced angle is an offset of the encoder: no machine file has one, and the loader refuses a map that is symmetric
 about another angle than 0.
@@ -102,7 +103,7 @@ def _file(machine: str, name: str, fault: Fault) -> str | None:
 
 @lru_cache(maxsize=1024)
 def _made(machine: str, name: str, fault: Fault) -> tuple[Path | None, str]:
-    """The file, or why there is none, "" where the error is none of the machine's magnetics."""
+    """The file, None for an error that the machine cannot have, and the loader's refusal, "" without one."""
     path = machine_path(machine)
     own = path.parent in (MACHINE_FILES, EXAMPLE_MACHINES)  # files of the user may have one name
     folder = FOLDER / (path.stem if own else f"{path.stem}-{zlib.crc32(str(path).encode()):08x}")
@@ -170,7 +171,8 @@ def step_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
 def held_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
     """Mean torque on a held shaft, at first and after LEARNED_S, and its errors."""
     mean_Nm, error_percent, learned_percent = _torque(scenario, recording)
-    return {"torque_mean_Nm": mean_Nm, "torque_error_percent": error_percent, "torque_error_2s_percent": learned_percent}
+    return {"torque_mean_Nm": mean_Nm, "torque_error_percent": error_percent,
+            "torque_error_2s_percent": learned_percent}
 
 
 def fast_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:

@@ -405,7 +405,8 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
         "hold", (("drift_deg", ""),), lambda parts: ("", parts[0], abs(_number(parts[1]))), "load / (N m)")),),
     "mismatch": tuple((
         f"Cost of a wrong machine file, {controller}", "By error of the firmware's file; right of 1: worse, for the"
-        " torque too much. Crosses: never, or the drive ended in a fault.", _costs(controller)) for controller in CONTROLLERS),
+        " torque too much. Crosses: never, or the drive ended in a fault.", _costs(controller))
+        for controller in CONTROLLERS),
     "robustness": (("Random drives", "Share of the drives below a value; dashed: the limit.", _distributions),),
 }  # fmt: skip
 

@@ -201,9 +201,9 @@ def _ranges() -> dict[Key, Target]:
 
 
 def _mismatches() -> dict[Key, Target]:
-    """What is promised for a motor that differs from its file: no fault within the range of `robustness` (the motor by
-    the file), the recovery, overshoot and learning of `inertia` and `misalignment`, and a torque within 1 % on a held shaft
-    after 2 s (tests/hil/test_table_scale.py). Other errors have no limit."""
+    """Promises for a motor that differs from its file: no fault within the range of `robustness` (the motor by the
+    file), the recovery, overshoot and learning of `inertia` and `misalignment`, and a torque within 1 % on a held
+    shaft after 2 s (tests/hil/test_table_scale.py). Other errors have no limit."""
     targets = {("mismatch", f"{machine}, {name}", "failed", "count"): Target(0.0)
                for machine in MACHINES for name in (mismatch.RIGHT, *mismatch.PROMISED)}
     targets |= {("mismatch", f"{machine}, inertia x {factor}", metric, ""): Target(limit)
