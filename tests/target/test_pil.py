@@ -6,9 +6,13 @@ import argparse
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from salient.cli import make_parser
+from salient.errors import UsageError
+from salient.experiments.scenario import load_scenarios, run_all, with_true_machine
+from salient.machine.path import machine_path
 from salient.target import pil
 
 SCENARIO = """
@@ -26,7 +30,7 @@ torque_Nm = 5.0
 
 def options(**given) -> argparse.Namespace:
     return argparse.Namespace(**{"scenario": None, "out": None, "target": "cortex-m4", "search": None, "seed": 1,
-                                 "bound": None, "figures": False, **given})
+                                 "bound": None, "figures": False, "true_machine": None, **given})
 
 
 @pytest.fixture
@@ -62,6 +66,25 @@ def test_equal_runs_write_equal_pages(scenario, tmp_path):
         pil.run(options(scenario=scenario, out=tmp_path / name))
     for name in ("processor.json", "report.html"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+
+
+@pytest.mark.in_turns
+def test_motor_of_another_file_is_that_of_pil_and_of_the_host(scenario, tmp_path):
+    """The image has the firmware's tables only; the plant is that of the pair, bit for bit as on the host."""
+    scenario.write_text(SCENARIO.replace('"traditional", ', "") + "[record]\nstep_us = 10.0\n")
+    heavy = tmp_path / "heavy.toml"
+    heavy.write_text(machine_path("saturating").read_text().replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.04"))
+    for name, true_machine in (("alone", None), ("pair", str(heavy))):
+        assert pil.run(options(scenario=scenario, out=tmp_path / name, true_machine=true_machine)) == 0
+    run_all(with_true_machine(load_scenarios(scenario), str(heavy)), tmp_path / "host")
+    alone, pair, host = (np.load(tmp_path / name / "salient" / "recording.npy") for name in ("alone", "pair", "host"))
+    assert pair.tobytes() == host.tobytes()
+    assert pair["speed_rpm"].max() == pytest.approx(0.5 * alone["speed_rpm"].max(), rel=0.05)
+
+
+def test_true_machine_without_a_scenario_is_refused():
+    with pytest.raises(UsageError, match="--true-machine saturating: only with a scenario"):
+        pil.run(options(figures=True, true_machine="saturating"))
 
 
 @pytest.mark.in_turns

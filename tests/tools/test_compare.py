@@ -436,7 +436,7 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
     on = subject(str(EXAMPLES / "fan12.toml"))
     scale = on.scale
     for name, of in ALL_CASES.items():
-        if name == "machines" or name in speed_range.GROUPS:  # of its own
+        if name in {"machines", "mismatch"} or name in speed_range.GROUPS:  # of its own
             continue
         of_paper = [case for case in of if case.scenario.machine == "saturating" and case.extractor != "counts"]
         own = [case for case in of_paper if is_allowed(replace(
@@ -512,7 +512,7 @@ def test_another_machine_is_judged_by_relative_targets_only_and_a_bundled_one_by
     targets = targets_of(on)
     conditions = {(case.group, case.condition) for of in ALL_CASES.values() for case in cases_of(of, on)}
     assert targets and {key[:2] for key in targets} <= conditions
-    assert {key[0] for key in targets} == {"inertia", "encoders", "misalignment", "standing_error"}
+    assert {key[0] for key in targets} == {"inertia", "encoders", "misalignment", "standing_error", "mismatch"}
     limits = {key[:1] + key[2:]: target.limit for key, target in TARGETS.items()}
     for key, target in targets.items():
         if key[0] != "standing_error":

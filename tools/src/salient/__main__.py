@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from salient.cli import make_parser
@@ -83,14 +82,9 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from salient.experiments.scenario import load_scenarios, run_all
+    from salient.experiments.scenario import load_scenarios, run_all, with_true_machine
 
-    scenarios = load_scenarios(scenario_path(options.scenario))
-    if options.true_machine is not None:
-        from salient.machine.cache import machine_image
-
-        machine_image(scenarios[0].machine, options.true_machine)  # checks it
-        scenarios = [replace(scenario, true_machine=options.true_machine) for scenario in scenarios]
+    scenarios = with_true_machine(load_scenarios(scenario_path(options.scenario)), options.true_machine)
     out = options.out or OUT / options.scenario.stem
     make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,

@@ -212,6 +212,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     task = pil.add_mutually_exclusive_group(required=True)
     task.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.toml")
     pil.add_argument("--out", type=Path, metavar="DIR", help=f"folder (default {_SHOWN_OUT}/pil_NAME)")
+    _add_bench_options(pil, "pil")
     pil.add_argument("--target", type=_one_of(TARGETS[1:]), default=TARGETS[1], metavar="NAME",
                      help=f"{either(TARGETS[1:])} (default {TARGETS[1]})")
     task.add_argument("--bound", nargs="?", const="all", metavar="VARIANT",

@@ -166,7 +166,7 @@ class Conditions:
     machine: str = _option("saturating", MACHINE, "machine", metavar="NAME|FILE", commands=_CONDITION, argument=False)
     true_machine: str | None = _option(None, MACHINE, "machine of the emulated motor, converter and supply, where it "
                                        "differs from that of the firmware, its DBC and the tools", metavar="NAME|FILE",
-                                       commands=("sim", "demo", "run"), argument=False)
+                                       commands=("sim", "demo", "run", "pil"), argument=False)
     controller: str = _option("salient", WORD, "controller at the start", metavar="NAME", choices=CONTROLLERS,
                               commands=("sim",))
     control_rate_hz: int = _option(40_000, INTEGER, "rate of the control interrupt in Hz", metavar="N",

@@ -1,4 +1,4 @@
-"""Reads TOML files of users: bounded in size and time, checked by a model, every mistake one line.
+"""Reads TOML files of users: bounded in size and time, checked by a model, every mistake one line. Writes such tables.
 
 A model is a subclass of Table. Its fields are tables or annotated with a check made here:
 
@@ -7,11 +7,12 @@ A model is a subclass of Table. Its fields are tables or annotated with a check 
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import stat
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
@@ -61,6 +62,22 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise TextFileError(f"not TOML: {error}") from None
     except (ValueError, RecursionError):  # of tomllib itself
         raise TextFileError("not TOML: a number too long or tables too deep") from None
+
+
+def toml_text(data: Mapping[str, Any], table: str = "") -> str:
+    """Numbers, strings and tables, as read_toml gives them, as the text of a TOML file. table: of the values."""
+    lines = [f"{key} = {toml_value(value)}" for key, value in data.items() if not isinstance(value, Mapping)]
+    parts = ["\n".join([f"[{table}]", *lines] if table else lines)] if lines or table else []
+    parts += [toml_text(value, f"{table}.{key}".lstrip(".")).rstrip("\n") for key, value in data.items()
+              if isinstance(value, Mapping)]
+    return "\n\n".join(parts) + "\n"
+
+
+def toml_value(value: bool | int | float | str) -> str:
+    """A number or string in TOML, exact."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

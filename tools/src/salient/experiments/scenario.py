@@ -482,6 +482,15 @@ def load_scenarios(path: Path) -> list[Scenario]:
     return scenarios
 
 
+def with_true_machine(scenarios: list[Scenario], true_machine: str | None) -> list[Scenario]:
+    """The scenarios of one file with another machine in the emulator, None for that of the file. UsageError: the two do
+    not fit."""
+    if true_machine is None:
+        return scenarios
+    machine_image(scenarios[0].machine, true_machine)  # checks them
+    return [replace(scenario, true_machine=true_machine) for scenario in scenarios]
+
+
 def _machine_of(path: Path, name: str) -> str:
     """Name or path of a machine of a scenario file."""
     relative = path.parent / name

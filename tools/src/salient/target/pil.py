@@ -11,7 +11,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from salient.experiments.scenario import RunResult, check_parameters, load_scenarios, write_summaries
+from salient.errors import UsageError
+from salient.experiments.scenario import (
+    RunResult,
+    check_parameters,
+    load_scenarios,
+    with_true_machine,
+    write_summaries,
+)
 from salient.paths import OUT, make_folder, scenario_path
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, PROCESSOR_HZ, estimable, fits
 from salient.target.isr_profile import IsrProfile, measure_run
@@ -21,6 +28,8 @@ from salient.target.pil_report import write_pil_report
 def run(options: argparse.Namespace) -> int:
     """Runs the scenario, computes the bound or measures the baseline, of which the command line has exactly one.
     Returns 0, or 1 when a drive ended in a fault."""
+    if options.true_machine is not None and options.scenario is None:
+        raise UsageError(f"--true-machine {options.true_machine}: only with a scenario")
     if options.figures:
         from salient.target.baseline import measure_and_write
 
@@ -30,7 +39,8 @@ def run(options: argparse.Namespace) -> int:
 
         known = baseline.read()["interrupt"] if estimable(options.target) else {}
         return bound_report.run(options.bound, options.target, {name: of["longest_run"] for name, of in known.items()})
-    return _run_scenario(options.scenario, options.out or OUT / f"pil_{options.scenario.stem}", options.target)
+    return _run_scenario(options.scenario, options.out or OUT / f"pil_{options.scenario.stem}", options.target,
+                         options.true_machine)
 
 
 def as_json(profile: IsrProfile, target: str) -> dict[str, Any]:
@@ -86,8 +96,8 @@ def summary(profiles: Mapping[str, IsrProfile], target: str) -> str:
     return "\n".join(lines)
 
 
-def _run_scenario(path: Path, out: Path, target: str) -> int:
-    scenarios = load_scenarios(scenario_path(path))
+def _run_scenario(path: Path, out: Path, target: str, true_machine: str | None) -> int:
+    scenarios = with_true_machine(load_scenarios(scenario_path(path)), true_machine)
     check_parameters(scenarios, target)
     make_folder(out)
     results: dict[str, RunResult] = {}

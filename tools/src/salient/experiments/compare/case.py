@@ -26,7 +26,8 @@ class Case:
 
     extractor: key of compare/metrics.EXTRACTORS. sample: distinguishes the runs of a condition, "" for a single run.
     traced: keep the torque over the paper's window for a plot. window_s: of the ripple, for extractors whose
-    recordings are longer. strokes: by which the load step is later than STEP_AT_S.
+    recordings are longer. strokes: by which the load step is later than STEP_AT_S. relative_to: the condition whose
+    first sample ratios are relative to, "" for its own.
     """
 
     group: str
@@ -38,6 +39,7 @@ class Case:
     traced: bool = False
     window_s: tuple[float, float] = RIPPLE_WINDOW_S
     strokes: float = 0.0
+    relative_to: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class Group:
     columns: (metric, statistic) of its rows, as far as its runs have them. The statistic is "" for a single run, else
     median, worst (maximum), spread (maximum over median), gap (widest between angles, modulo STROKE_DEG) or count (of
     failed runs). long: runs only when named. worst: metrics of which the ten worst runs are named below the table.
-    ratios: metric -> its quotient by that of the first sample with the same extractor, a metric of its own.
+    ratios: metric -> its quotient by that of the first sample with the same extractor, of the condition or of the one
+    that it is relative to, a metric of its own.
     """
 
     title: str

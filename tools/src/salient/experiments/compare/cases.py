@@ -6,14 +6,20 @@ and, where a metric is a statistic, by sample. Identical runs are executed once 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from salient.config import CONDITIONS, CONTROLLERS
-from salient.experiments.compare import count_cases, every_machine, random_cases, range_cases, speed_range
+from salient.experiments.compare import (
+    count_cases,
+    every_machine,
+    mismatch,
+    random_cases,
+    range_cases,
+    speed_range,
+)
 from salient.experiments.compare.case import (
     LOAD_NM,
     MACHINES,
@@ -25,6 +31,7 @@ from salient.experiments.compare.case import (
     make_scenario,
 )
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
+from salient.toml_file import toml_value
 
 # Parameters of the drive that conditions set, by meaning; the numbers are those of docs/reference/parameters.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
@@ -276,6 +283,20 @@ GROUPS: dict[str, Group] = {
     "standing_error": Group("mean speed over whole turns, 40 kHz", range_cases.standing_error,
                             (("mean_error_rpm", ""),), long=True),
     "hold": Group("load at standstill, 40 kHz", range_cases.hold, (("drift_deg", ""),), long=True),
+    "mismatch": Group("wrong machine file in the drive, right motor: load step of 8 N m at 150 r/min and 1 s after it"
+                      " (salient: 6 s), start to 600 r/min, half of the torque on a held shaft at 0.1 and 1.5 times the"
+                      " base speed, 40 kHz", mismatch.mismatch,
+                      (("failed", "count"), ("ripple", ""), ("ripple_to_right", ""), ("ripple_step", ""),
+                       ("ripple_step_to_right", ""), ("speed_dip_rpm", ""), ("dip_to_right", ""),
+                       ("recovery_time_s", ""), ("recovery_to_right", ""), ("settling_time_s", ""),
+                       ("settling_to_right", ""), ("overshoot_percent", ""), ("torque_error_percent", ""),
+                       ("torque_to_right", ""), ("torque_error_2s_percent", ""), ("torque_error_fast_percent", ""),
+                       ("torque_fast_to_right", ""), ("torque_error_fast_2s_percent", "")),
+                      long=True,
+                      ratios={"ripple": "ripple_to_right", "ripple_step": "ripple_step_to_right",
+                              "speed_dip_rpm": "dip_to_right", "recovery_time_s": "recovery_to_right",
+                              "settling_time_s": "settling_to_right", "torque_mean_Nm": "torque_to_right",
+                              "torque_fast_Nm": "torque_fast_to_right"}),
     "robustness": Group("random drives: start to 150 or 600 r/min, then 8 N m; random machines, speeds and loads; 40"
                         " kHz", random_cases.robustness,
                         (("failed", "count"), ("mean_error_percent", "worst"), ("deviation_rpm", "worst"),
@@ -341,16 +362,10 @@ def scenario_toml(case: Case) -> str:
         elif isinstance(value, Record):
             tables.append((f"[{key}]", vars(value)))
         else:
-            lines.append(f"{key} = {_toml(value)}")
+            lines.append(f"{key} = {toml_value(value)}")
     for head, content in tables:
-        lines += ["", head, *(f"{key} = {_toml(value)}" for key, value in content.items())]
+        lines += ["", head, *(f"{key} = {toml_value(value)}" for key, value in content.items())]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: bool | int | float | str) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 def _khz(rate_hz: int) -> str:

@@ -12,8 +12,8 @@ from typing import TextIO
 
 from salient.config import DEFAULTS
 from salient.errors import UsageError, close_names
-from salient.experiments.compare import baseline, results_file, summary_file, table
-from salient.experiments.compare.case import Case
+from salient.experiments.compare import baseline, mismatch, results_file, summary_file, table
+from salient.experiments.compare.case import MACHINES, Case
 from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
 from salient.experiments.compare.machine import Subject, cases_of, subject, targets_of
 from salient.experiments.compare.runner import RunMetrics, run_all
@@ -44,7 +44,9 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         cases = _with_true_machine(cases, options.machine, options.true_machine)
     cases = _with_settings(_first_samples(cases, options.samples), options.set)
     earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
-    make_folder(options.out, (f"{FAILED}/*.toml", results_file.NAME, PAGE, summary_file.NAME))
+    make_folder(options.out, (f"{FAILED}/*.toml", f"{mismatch.FILES}/*/*.*", results_file.NAME, PAGE,
+                              summary_file.NAME))
+    machine_files = mismatch.copy_files(cases, options.out)
     runs = run_all(cases, options.jobs, sys.stderr, options.out, not options.resume, options.scheduler)
     rows = table.make_rows(runs, targets)
     changes: list[baseline.Change] = []
@@ -68,6 +70,11 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         stream.write(f"and {len(failed) - _FAILED_LISTED_MAX} more in {options.out / FAILED}\n")
     if change_summary:
         stream.write(f"\n{change_summary}\n")
+    for wrong, right in machine_files[:1]:
+        stream.writelines(f"{line}\n" for line in mismatch.refused(
+            MACHINES if options.machine is None else (options.machine,)))
+        stream.write(f"\nwrong machine files: {options.out / mismatch.FILES}; for example {COMMAND} demo --machine"
+                     f" {shlex.quote(str(wrong))} --true-machine {shlex.quote(right)}\n")
     stream.write(f"\nresults: {options.out / results_file.NAME}\npage:    {options.out / 'compare.html'}\n")
     return 1 if any(change.worse for change in changes) else 0
 
@@ -91,6 +98,8 @@ def _with_true_machine(cases: Sequence[Case], machine: str | None, true_machine:
     """The cases with another machine in the emulator. UsageError: without --machine, or the two do not fit."""
     if machine is None:
         raise UsageError(f"--true-machine {true_machine}: only with --machine, whose drive it replaces the motor of")
+    if any(case.group == mismatch.GROUP for case in cases):
+        raise UsageError(f"--true-machine {true_machine}: not with {mismatch.GROUP}, whose runs have their own")
     machine_image(machine, true_machine)  # checks them
     return [replace(case, scenario=replace(case.scenario, true_machine=true_machine)) for case in cases]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from salient.bench.rig import bench_variables
-from salient.experiments.compare import count_cases, every_machine, speed_range
+from salient.experiments.compare import count_cases, every_machine, mismatch, speed_range
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import RIPPLE_RPM, STROKE_DEG
 from salient.experiments.compare.targets import TARGETS, Key, Target
@@ -27,6 +27,8 @@ PAPER = "saturating"
 _RELATIVE: dict[tuple[str, str], Callable[[Scale], float]] = {
     **dict.fromkeys((("inertia", "recovery_ratio"), ("inertia", "swing_percent"), ("inertia", "overshoot_percent"),
                      ("encoders", "failed"), ("encoders", "against_periods"), ("misalignment", "ripple_6s_ratio")),
+                    lambda scale: 1.0),
+    **dict.fromkeys((("mismatch", metric) for metric in ("recovery_to_right", "overshoot_percent", "ripple_to_right")),
                     lambda scale: 1.0),
     ("standing_error", "mean_error_rpm"): lambda scale: scale.speed,
 }
@@ -78,12 +80,12 @@ def is_allowed(scenario: Scenario) -> bool:
 
 def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Case]:
     """The cases of the paper's machine among `cases`, for another machine, and its own runs of the groups `machines`
-    and those of speed_range.py and count_cases.py."""
+    and those of speed_range.py, count_cases.py and mismatch.py."""
     of_paper, sized = [], {}
     groups: dict[str, None] = {}
     for case in cases:
         groups[case.group] = None  # in order
-        if case.group in speed_range.GROUPS or case.extractor == count_cases.EXTRACTOR:
+        if case.group in {**speed_range.GROUPS, **mismatch.GROUPS} or case.extractor == count_cases.EXTRACTOR:
             continue
         if case.scenario.machine == PAPER:
             own_case = _case(case, on)
@@ -92,7 +94,7 @@ def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Ca
         elif case.extractor == "every_machine":
             sized[case.controller] = replace(case, condition=on.machine.name, scenario=every_machine.scenario(
                 machine_path(on.path), case.controller))
-    generators = {**speed_range.GROUPS, **count_cases.GROUPS}
+    generators = {**speed_range.GROUPS, **count_cases.GROUPS, **mismatch.GROUPS}
     own = [case for group in groups if group in generators for case in generators[group](quick, (on.path,))]
     if sized:
         own += speed_range.of_any_machine(quick, on.path)

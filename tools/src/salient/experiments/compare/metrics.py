@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.experiments import metrics
-from salient.experiments.compare import count_cases, every_machine, speed_range
+from salient.experiments.compare import count_cases, every_machine, mismatch, speed_range
 from salient.experiments.scaled import scale_of_name
 from salient.experiments.scenario import Scenario
 from salient.machine.definition import Machine
@@ -97,6 +97,18 @@ METRICS = {
     "phase_rms_A": Metric("RMS current of a phase", "A", 2, 0.1),
     "rms_to_best": Metric("RMS current", "of the best pulse's", 3, 0.01),
     "copper_to_least": Metric("sum of squares of the currents", "of the least without ripple", 3, 0.003),
+    "torque_fast_Nm": Metric("mean torque at 1.5 times the base speed", "N m", 3, 0.01),
+    "torque_error_fast_percent": Metric("error of the mean torque at 1.5 times the base speed", "%", 2, 0.1),
+    "torque_error_2s_percent": Metric("error of the mean torque after 2 s", "%", 2, 0.1),
+    "torque_error_fast_2s_percent": Metric("error of the mean torque at 1.5 times the base speed after 2 s", "%", 2,
+                                           0.1),
+    "ripple_to_right": Metric("K_t over 0.1 s", "of the right file's", 2, 0.05),
+    "ripple_step_to_right": Metric("K_t from 20 ms after a load step", "of the right file's", 2, 0.05),
+    "dip_to_right": Metric("speed drop", "of the right file's", 2, 0.02),
+    "recovery_to_right": Metric("recovery time", "of the right file's", 2, 0.05),
+    "settling_to_right": Metric("settling time", "of the right file's", 3, 0.005),
+    "torque_to_right": Metric("mean torque", "of the right file's", 3, 0.002),
+    "torque_fast_to_right": Metric("mean torque at 1.5 times the base speed", "of the right file's", 3, 0.002),
     "dip_ratio": Metric("speed drop by load", "of that at half base speed", 2, 0.05),
     "torque_step_percent": Metric("largest torque step between strokes", "% of load", 2, 0.3),
     "peak_current_A": Metric("peak phase current", "A", 1, 0.5),
@@ -200,6 +212,19 @@ def fast_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Windo
 
 def speed_ramps_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     return speed_range.speed_ramps_metrics(scenario, recording)
+
+
+def mismatch_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    """A run of mismatch.py; so are the next two."""
+    return mismatch.step_metrics(scenario, recording)
+
+
+def mismatch_held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return mismatch.held_metrics(scenario, recording)
+
+
+def mismatch_fast_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
+    return mismatch.fast_metrics(scenario, recording)
 
 
 def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
@@ -331,6 +356,9 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "held_copper": held_copper_metrics,
     "fast_step": fast_step_metrics,
     "speed_ramps": speed_ramps_metrics,
+    "mismatch_step": mismatch_step_metrics,
+    "mismatch_held": mismatch_held_metrics,
+    "mismatch_fast": mismatch_fast_metrics,
     "step_and_ripple": step_and_ripple_metrics,
     "encoder": encoder_metrics,
     "encoder_course": encoder_course_metrics,

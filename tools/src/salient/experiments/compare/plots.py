@@ -31,6 +31,7 @@ _TARGET_COLOUR = "#222222"
 _PUBLISHED_COLOUR = "#6f6f6f"
 _MARKER = {"traditional": "s", "paper": "D", "salient": "o"}
 _LINES = matplotlib.colormaps["viridis"]
+_MACHINE_COLOURS = ("#1b4f9c", "#c8641e", "#1b7f5c", "#8a3b8f")
 _CHANGES_MAX = 60
 
 _STYLE: Any = {**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}
@@ -273,6 +274,48 @@ def _curves(group: str, metrics: Sequence[tuple[str, str]], where: Callable[[lis
     return draw
 
 
+def _costs(controller: str) -> Callable[[Content], Figure | None]:
+    """Ratios to the run with the right file over the errors of the file, panels by metric, a marker per machine."""
+    def draw(content: Content) -> Figure | None:
+        rows = [row for row in _rows(content, "mismatch") if controller in {**row["values"], **row["failed"]}]
+        shown = [row for row in rows if row["figure"].endswith("_to_right")]
+        if not shown:
+            return None
+        machines, errors, names = (list(dict.fromkeys(parts)) for parts in zip(*(
+            (*row["condition"].split(", "), row["figure"]) for row in shown), strict=True))
+        names = [name for name in names if any(controller in row["values"] for row in shown if row["figure"] == name)]
+        figure, axes = _panels(len(names), columns=4, height_in=0.9 + 0.17 * len(errors), sharey=True)
+        for axis, name in zip(axes, names, strict=True):
+            of = METRICS[name]
+            for number, machine in enumerate(machines):
+                look: Any = {"color": _MACHINE_COLOURS[number % len(_MACHINE_COLOURS)], "linestyle": "",
+                             "marker": "os^D"[number % 4], "markersize": 4.5}
+                places = {errors.index(row["condition"].split(", ")[1]) + 0.16 * (number - (len(machines) - 1) / 2):
+                          row["values"].get(controller) for row in shown
+                          if row["figure"] == name and row["condition"].split(", ")[0] == machine}
+                axis.plot([value for value in places.values() if value is not None],
+                          [y for y, value in places.items() if value is not None], **look)
+                missing = [y for y, value in places.items() if value is None]
+                axis.plot([0.98] * len(missing), missing, **{**look, "marker": "x"},
+                          transform=axis.get_yaxis_transform())
+            axis.axvline(1.0, color="#555555", linewidth=0.8)
+            for y in range(1, len(errors)):
+                axis.axhline(y - 0.5, color="#dddddd", linewidth=0.5)
+            axis.set_xlim(min(axis.get_xlim()[0], 0.9), max(axis.get_xlim()[1], 1.1))
+            if axis.get_xlim()[1] > 3.0:
+                _logarithmic(axis.xaxis)
+            axis.set_title(of.label, fontsize=8.0)
+            axis.set_xlabel("of the right file's")
+        axes[0].set_yticks(range(len(errors)), errors, fontsize=7.5)
+        axes[0].set_ylim(len(errors) - 0.5, -0.5)
+        handles = [Line2D([], [], color=_MACHINE_COLOURS[number % len(_MACHINE_COLOURS)], marker="os^D"[number % 4],
+                          linestyle="") for number in range(len(machines))]
+        figure.legend(handles, machines, loc="outside upper right", ncols=len(machines))
+        return figure
+
+    return draw
+
+
 def _visible(value: float | None, of: Metric) -> float:
     """For a logarithmic axis: at least the metric's resolution; nothing is drawn for an event that did not occur."""
     return np.nan if value is None else max(value * of.factor, of.resolution)
@@ -360,6 +403,10 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
         "speed / (r/min)")),),
     "hold": (("Load at standstill", "One line per machine. Short lines: target.", _curves(
         "hold", (("drift_deg", ""),), lambda parts: ("", parts[0], abs(_number(parts[1]))), "load / (N m)")),),
+    "mismatch": tuple((
+        f"Cost of a wrong machine file, {controller}", "By error of the firmware's file; right of 1: worse, for the"
+        " torque too much. Crosses: never, or the drive ended in a fault.", _costs(controller))
+        for controller in CONTROLLERS),
     "robustness": (("Random drives", "Share of the drives below a value; dashed: the limit.", _distributions),),
 }  # fmt: skip
 

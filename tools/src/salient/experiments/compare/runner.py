@@ -17,7 +17,7 @@ from salient.bench.programs import EmulatorError, executable, reference_executab
 from salient.bench.session import SessionError
 from salient.experiments import metrics as run_metrics
 from salient.experiments import tasks
-from salient.experiments.compare import every_machine, reference
+from salient.experiments.compare import every_machine, mismatch, reference
 from salient.experiments.compare import metrics as compare_metrics
 from salient.experiments.compare.case import Case
 from salient.experiments.compare.cases import GROUPS
@@ -29,7 +29,7 @@ from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.progress import Progress, steps_of
 
-_METRICS_MODULES = (run_metrics, compare_metrics, every_machine, reference)
+_METRICS_MODULES = (run_metrics, compare_metrics, every_machine, mismatch, reference)
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,13 @@ def _programs_digest(case: Case) -> str:
 
 
 def _with_ratios(runs: Sequence[RunMetrics]) -> list[RunMetrics]:
-    """Adds the ratios of the groups to the metrics of all samples but the first of each condition."""
+    """Adds the ratios of the groups to the metrics of all samples but the first that they are relative to."""
     first_of: dict[tuple[str, ...], Metrics] = {}
     completed = []
     for run in runs:
         case, added = run.case, {}
-        first = first_of.setdefault((case.group, case.condition, case.controller, case.extractor), run.metrics)
+        of = case.relative_to or case.condition
+        first = first_of.setdefault((case.group, of, case.controller, case.extractor), run.metrics)
         for metric, ratio in GROUPS[case.group].ratios.items():
             if first is not run.metrics and metric in run.metrics and metric in first:
                 added[ratio] = _ratio(run.metrics[metric], first[metric])

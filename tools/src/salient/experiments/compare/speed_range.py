@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -160,6 +161,20 @@ def torque_conditions(quick: bool, machines: Sequence[str] = CONDITION_MACHINES)
             for quadrant, sign in QUADRANTS.items():
                 yield Case("torque_conditions", f"{subject.label}, {name}, {quadrant}", "salient", "held",
                            subject.held(speed_rpm, sign * subject.torque_max_Nm, **change))
+
+
+def held_parts(machine: str, of_base: float, of_rated: float, fast_of_base: float, of_largest: float
+               ) -> tuple[Scenario, Scenario | None]:
+    """Parts of the rated torque, and of the largest one above base speed, on a held shaft, without a limit of their
+    own; None: the machine is not as fast."""
+    subject = _Subject(machine)
+    (speed_rpm,) = subject.speeds_rpm((of_base,))
+    held = replace(subject.held(speed_rpm, _three_digits(of_rated * subject.data.torque_rated_Nm)), parameters={})
+    fast_rpm = subject.speeds_rpm((fast_of_base,))
+    if not fast_rpm:
+        return held, None
+    (largest_Nm,) = subject.rough_Nm(fast_rpm)
+    return held, replace(subject.held(fast_rpm[0], _three_digits(of_largest * largest_Nm)), parameters={})
 
 
 class _Subject:
