@@ -901,7 +901,7 @@ TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_
         for (unsigned k = 0; k < 12; k++) {
             for (unsigned period = 1; period < each; period++) {
                 hal.time_us += 25;
-                drive_control_interrupt(&drive);
+                drive_control_interrupt(&drive, &hal);
                 deferred_interrupt(&drive, &hal);
             }
             periods(1);
@@ -1691,7 +1691,7 @@ TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_
 TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_with_a_controller_of_one_quadrant) {
     const auto limited = [this] {
         drive_telemetry_t telemetry;
-        telemetry_collect(&drive, hal.time_us, &telemetry);
+        telemetry_collect(&drive, &hal, hal.time_us, &telemetry);
         return bool(telemetry.status.speed_limited);
     };
     periods(100);
@@ -1735,7 +1735,7 @@ TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
     for (unsigned phase = 0; phase < 6; phase++) {
         drive.flux.phases = drive.degraded.lost = 1u << phase;
         drive_telemetry_t telemetry;
-        telemetry_collect(&drive, 0, &telemetry);
+        telemetry_collect(&drive, &hal, 0, &telemetry);
         EXPECT_EQ(telemetry.phase_fault & 63u, 1u << phase);
         EXPECT_EQ(telemetry.phases_e_f.phase_e, phase == 4);
         EXPECT_EQ(telemetry.phases_e_f.phase_f, phase == 5);
@@ -1754,7 +1754,7 @@ TEST_F(Drive, telemetry_names_the_lost_phase_s_limit_of_the_available_torque_whi
         drive.control_parameters.degraded.allowed = true;
         periods(100);
         drive_telemetry_t telemetry;
-        telemetry_collect(&drive, hal.time_us, &telemetry);
+        telemetry_collect(&drive, &hal, hal.time_us, &telemetry);
         EXPECT_EQ(telemetry.available_torque.forward_nm, 3 * 256) << lost;
         EXPECT_EQ(telemetry.available_torque.forward_limited_by,
                   DRIVE_AVAILABLE_TORQUE_FORWARD_LIMITED_BY_DEGRADED_CHOICE)
@@ -1793,7 +1793,7 @@ TEST_F(Drive, telemetry_reports_the_resistance_of_the_parameter_and_what_is_foun
     for (const double beyond_ohm : {0.0, 0.01, -0.01}) {
         drive.table_scale.resistance_q40 = int32_t(std::lround(beyond_ohm * 25e-6 * 0x1p40));
         drive_telemetry_t telemetry;
-        telemetry_collect(&drive, 0, &telemetry);
+        telemetry_collect(&drive, &hal, 0, &telemetry);
         EXPECT_NEAR(telemetry.estimates.resistance_ohm / 65536.0, ohm + beyond_ohm, 2.0 / 65536.0) << beyond_ohm;
     }
 }
