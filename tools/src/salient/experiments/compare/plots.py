@@ -301,12 +301,16 @@ def _costs(controller: str) -> Callable[[Content], Figure | None]:
             axis.axvline(1.0, color="#555555", linewidth=0.8)
             for y in range(1, len(errors)):
                 axis.axhline(y - 0.5, color="#dddddd", linewidth=0.5)
-            axis.set_xlim(min(axis.get_xlim()[0], 0.9), max(axis.get_xlim()[1], 1.1))
-            if axis.get_xlim()[1] > 3.0:
+            ratios = [value for row in shown if row["figure"] == name
+                      and (value := row["values"].get(controller)) is not None]
+            low, high = min([0.95, *ratios]), max([1.05, *ratios])
+            axis.set_xlim(low / (high / low) ** 0.1, high * (high / low) ** 0.1)
+            if high > 3.0:
                 _logarithmic(axis.xaxis)
+            axis.tick_params(axis="y", labelsize=7.5)
             axis.set_title(of.label, fontsize=8.0)
             axis.set_xlabel("of the right file's")
-        axes[0].set_yticks(range(len(errors)), errors, fontsize=7.5)
+        axes[0].set_yticks(range(len(errors)), errors)
         axes[0].set_ylim(len(errors) - 0.5, -0.5)
         handles = [Line2D([], [], color=_MACHINE_COLOURS[number % len(_MACHINE_COLOURS)], marker="os^D"[number % 4],
                           linestyle="") for number in range(len(machines))]
