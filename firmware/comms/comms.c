@@ -111,8 +111,8 @@ static void receive_parameters(comms_t *comms, hal_t *hal, parameters_t *paramet
     frame_queue_push(&comms->responses, &response);
 }
 
-static void receive_xcp(comms_t *comms, hal_t *hal, parameters_t *parameters,
-                        const parameters_conditions_t *conditions, const hal_can_frame_t *frame, uint32_t time_us) {
+static void receive_xcp(comms_t *comms, hal_t *hal, parameters_t *parameters, const parameters_conditions_t *conditions,
+                        const hal_can_frame_t *frame, uint32_t time_us) {
     if (frame_queue_free(&comms->responses) == 0) {
         counter_add(&comms->telemetry.dropped, 1);
         return;

@@ -45,9 +45,8 @@ struct hal {
         left = steps_of_frame;
         if (own) {
             std::iter_swap(mailboxes.begin(),
-                           std::min_element(mailboxes.begin(), mailboxes.end(), [](const auto &a, const auto &b) {
-                               return a.identifier < b.identifier;
-                           }));
+                           std::min_element(mailboxes.begin(), mailboxes.end(),
+                                            [](const auto &a, const auto &b) { return a.identifier < b.identifier; }));
         }
     }
 };
@@ -120,7 +119,8 @@ struct World {
 
     // A list of `frames` frames at every control period.
     void measure(unsigned frames) {
-        std::vector<std::vector<uint8_t>> commands = {{0xFF, 0}, {0xF8, 0, 4}, {0xF7, 4}, {0xD5, 0, 1, 0}, {0xD4, 0, 0, 0, uint8_t(frames)}};
+        std::vector<std::vector<uint8_t>> commands = {
+            {0xFF, 0}, {0xF8, 0, 4}, {0xF7, 4}, {0xD5, 0, 1, 0}, {0xD4, 0, 0, 0, uint8_t(frames)}};
         const uint32_t key = ~4711u;
         for (unsigned i = 0; i < 4; i++) {
             commands[2].push_back(uint8_t(key >> 8 * i));
