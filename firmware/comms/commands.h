@@ -78,7 +78,7 @@ typedef enum {
     COMMANDS_REJECTED,
     COMMANDS_ACCEPTED,
     COMMANDS_COMMAND,
-    COMMANDS_XCP,               /* an XCP_COMMAND (xcp.h) */
+    COMMANDS_XCP, /* an XCP_COMMAND (xcp.h) */
     COMMANDS_PARAMETER_REQUEST,
     COMMANDS_PARAMETER_SET
 } commands_frame_t;

@@ -43,9 +43,9 @@ typedef struct {
 
 /* Bytes of a command without data and keys of a count of its own; 0: one byte, or a command of xcp_daq.h. */
 static const uint8_t least_bytes[] = {
-    [DOWNLOAD - DOWNLOAD] = 2, [SHORT_UPLOAD - DOWNLOAD] = 8, [UPLOAD - DOWNLOAD] = 2,
-    [SET_MTA - DOWNLOAD] = 8,  [UNLOCK - DOWNLOAD] = 2,       [GET_SEED - DOWNLOAD] = 3,
-    [SET_REQUEST - DOWNLOAD] = 4, [GET_ID - DOWNLOAD] = 2,    [CONNECT - DOWNLOAD] = 2,
+    [DOWNLOAD - DOWNLOAD] = 2,    [SHORT_UPLOAD - DOWNLOAD] = 8, [UPLOAD - DOWNLOAD] = 2,
+    [SET_MTA - DOWNLOAD] = 8,     [UNLOCK - DOWNLOAD] = 2,       [GET_SEED - DOWNLOAD] = 3,
+    [SET_REQUEST - DOWNLOAD] = 4, [GET_ID - DOWNLOAD] = 2,       [CONNECT - DOWNLOAD] = 2,
 };
 
 static bool is_whole(const uint8_t *command, unsigned bytes) {
@@ -121,8 +121,7 @@ static xcp_error_t connect(xcp_t *xcp, message_t *response) {
 }
 
 static xcp_error_t get_status(const xcp_t *xcp, const nvm_store_t *store, message_t *response) {
-    const unsigned status =
-        (xcp->daq.running ? STATUS_DAQ : 0) | (store->saving == NVM_STORE_SAVING ? STORE_CAL : 0);
+    const unsigned status = (xcp->daq.running ? STATUS_DAQ : 0) | (store->saving == NVM_STORE_SAVING ? STORE_CAL : 0);
     const uint8_t bytes[] = {(uint8_t)status, (uint8_t)(RESOURCES & ~xcp->unlocked), 0, 0, 0};
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;
@@ -227,8 +226,8 @@ static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, cons
     return upload(xcp, parameters, command[1], response);
 }
 
-static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsigned bytes,
-                           const xcp_context_t *context, uint32_t time_us, message_t *response) {
+static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsigned bytes, const xcp_context_t *context,
+                           uint32_t time_us, message_t *response) {
     if (!is_whole(command, bytes)) {
         return XCP_ERROR_SYNTAX;
     }

@@ -15,14 +15,16 @@
  * Reading is free. Measuring, which takes time of the interrupts, and the triggered buffer need resource DAQ, writing a
  * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as that of the
  * arming: a random or recorded frame opens nothing. A seed serves one attempt within ARMING_RESPONSE_MAX_US. Both are
- * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a command.
+ * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a
+ * command.
  *
  * A write of a parameter is a set of one (parameter_set.h): staged, checked as any other, and applied or refused. It
  * is refused while another set is staged. In a run tunable parameters only. SET_REQUEST STORE_CAL stores.
  *
  * Measuring: one DAQ list, of a choice of three events, of at most SAMPLER_CHANNELS_MAX entries within single words.
  * Records that the bus does not take are lost, and counted (drive_t.sampler.lost); the time in the first frame of a
- * record shows them. DAQ frames have the lowest priority of the drive but for two, and only one of them is in a mailbox.
+ * record shows them. DAQ frames have the lowest priority of the drive but for two, and only one of them is in a
+ * mailbox.
  */
 #ifndef COMMS_XCP_H
 #define COMMS_XCP_H
@@ -86,7 +88,7 @@ typedef struct {
     uint8_t event;                /* sampler_event_t - 1 */
     uint8_t divider;
     bool timestamps, selected, running;
-    uint8_t next_odt;                            /* of `record`; at `odts` there is none left */
+    uint8_t next_odt;                           /* of `record`; at `odts` there is none left */
     uint32_t record[1u + SAMPLER_CHANNELS_MAX]; /* of which the frames are sent */
 } xcp_daq_t;
 

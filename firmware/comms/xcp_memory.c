@@ -180,8 +180,7 @@ xcp_error_t xcp_memory_write(xcp_t *xcp, const xcp_context_t *context, uint32_t 
     if (bytes != WORD_BYTES || offset % WORD_BYTES != 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
-    const uint32_t value =
-        from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 | (uint32_t)from[3] << 24;
+    const uint32_t value = from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 | (uint32_t)from[3] << 24;
     return area == XCP_AREA_SCOPE ? write_scope(xcp, offset / WORD_BYTES, value)
                                   : write_parameter(xcp, context, offset / WORD_BYTES, value);
 }

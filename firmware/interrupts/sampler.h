@@ -66,17 +66,17 @@ typedef struct {
     uint32_t event; /* at which it records, sampler_event_t; 0: none. Written last when it is armed */
     sampler_state_t state;
     sampler_setup_t setup;
-    uint32_t record_words; /* the channels; before them in a stream the time, us */
-    uint32_t capacity;     /* of the ring, records */
-    uint32_t place;        /* of the next record in the ring, words; of a complete buffer that of the oldest one */
-    uint32_t missing;      /* records by which fewer than `before` precede the trigger */
-    uint32_t following;    /* records from the trigger on that are still to be written */
-    uint32_t countdown;    /* events to the next record */
+    uint32_t record_words;   /* the channels; before them in a stream the time, us */
+    uint32_t capacity;       /* of the ring, records */
+    uint32_t place;          /* of the next record in the ring, words; of a complete buffer that of the oldest one */
+    uint32_t missing;        /* records by which fewer than `before` precede the trigger */
+    uint32_t following;      /* records from the trigger on that are still to be written */
+    uint32_t countdown;      /* events to the next record */
     uint32_t trigger_events; /* events from the trigger to record number `before` - `missing`, from the oldest on */
     uint32_t written, taken; /* records of a stream, modulo 2^32; the second one is written by the background */
     uint32_t taken_place;
-    uint32_t lost;           /* records of a stream */
-    int32_t last;            /* value of the variable at the event before; unsigned less 2^31 */
+    uint32_t lost; /* records of a stream */
+    int32_t last;  /* value of the variable at the event before; unsigned less 2^31 */
     bool has_last;
     uint32_t ring[SAMPLER_WORDS > 0u ? SAMPLER_WORDS : 1u];
 } sampler_t;

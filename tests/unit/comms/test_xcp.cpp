@@ -82,8 +82,8 @@ TEST_F(Xcp, connects_and_disconnects_with_the_responses_of_the_standard) {
 
 TEST_F(Xcp, an_unknown_command_and_a_short_one_are_refused) {
     open();
-    const unsigned known[] = {0xF0, 0xF4, 0xF5, 0xF6, 0xF7, 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD, 0xFE, 0xFF, 0xD3, 0xD4,
-                              0xD5, 0xD6, 0xD7, 0xD8, 0xD9, 0xDA, 0xDC, 0xDD, 0xDE, 0xDF, 0xE0, 0xE1, 0xE2};
+    const unsigned known[] = {0xF0, 0xF4, 0xF5, 0xF6, 0xF7, 0xF8, 0xF9, 0xFA, 0xFB, 0xFC, 0xFD, 0xFE, 0xFF, 0xD3,
+                              0xD4, 0xD5, 0xD6, 0xD7, 0xD8, 0xD9, 0xDA, 0xDC, 0xDD, 0xDE, 0xDF, 0xE0, 0xE1, 0xE2};
     for (unsigned code = 0; code < 255; code++) {
         if (std::find(std::begin(known), std::end(known), code) == std::end(known)) {
             EXPECT_EQ(send({uint8_t(code), 0, 0, 0, 0, 0, 0, 0}), failed(XCP_ERROR_UNKNOWN)) << code;
@@ -420,7 +420,8 @@ TEST_F(Xcp, stores_the_parameters_while_the_drive_does_not_run) {
 
 TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     open();
-    const uint32_t setup[XCP_SCOPE_WORDS] = {0, SAMPLER_EVENT_DEFERRED, 2, 100, SAMPLER_EQUAL, 0xFFFFFFFFu, 40, 16, 24, 1, 2, 8, 12};
+    const uint32_t setup[XCP_SCOPE_WORDS] = {
+        0, SAMPLER_EVENT_DEFERRED, 2, 100, SAMPLER_EQUAL, 0xFFFFFFFFu, 40, 16, 24, 1, 2, 8, 12};
     for (unsigned i = 1; i < XCP_SCOPE_WORDS; i++) {
         ASSERT_EQ(write(XCP_AREA_SCOPE + 4 * i, setup[i]), DONE);
         EXPECT_EQ(short_upload(XCP_AREA_SCOPE + 4 * i, 4), bytes_t{0xFF} + word(setup[i]));
@@ -434,11 +435,16 @@ TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     };
     const uint32_t end = sizeof(drive_t);
     const std::pair<unsigned, std::vector<uint32_t>> wrong[] = {
-        {XCP_SCOPE_EVENT, {0, 4, 258, 0xFFFFFFFFu}},    {XCP_SCOPE_DIVIDER, {0, 65536, 65537}},
-        {XCP_SCOPE_BEFORE, {2047, 65536 + 5}},          {XCP_SCOPE_CONDITION, {SAMPLER_CONDITIONS, 256, 0xFFFFFFFFu}},
-        {XCP_SCOPE_VARIABLE, {end, 0x40000, 0x80000000u}}, {XCP_SCOPE_LEFT, {32, 256}},
-        {XCP_SCOPE_RIGHT, {32, 256, 256 + 5}},          {XCP_SCOPE_CHANNELS, {0, 9, 256 + 2}},
-        {XCP_SCOPE_CHANNEL, {1, 2, end, 0x40008}},      {XCP_SCOPE_CHANNEL + 1, {3, 0xFFFFFFFCu}}};
+        {XCP_SCOPE_EVENT, {0, 4, 258, 0xFFFFFFFFu}},
+        {XCP_SCOPE_DIVIDER, {0, 65536, 65537}},
+        {XCP_SCOPE_BEFORE, {2047, 65536 + 5}},
+        {XCP_SCOPE_CONDITION, {SAMPLER_CONDITIONS, 256, 0xFFFFFFFFu}},
+        {XCP_SCOPE_VARIABLE, {end, 0x40000, 0x80000000u}},
+        {XCP_SCOPE_LEFT, {32, 256}},
+        {XCP_SCOPE_RIGHT, {32, 256, 256 + 5}},
+        {XCP_SCOPE_CHANNELS, {0, 9, 256 + 2}},
+        {XCP_SCOPE_CHANNEL, {1, 2, end, 0x40008}},
+        {XCP_SCOPE_CHANNEL + 1, {3, 0xFFFFFFFCu}}};
     for (const auto &[member, values] : wrong) {
         for (const uint32_t value : values) {
             refuses(member, value);

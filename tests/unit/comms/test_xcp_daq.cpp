@@ -124,7 +124,8 @@ TEST_F(XcpDaq, refuses_more_than_there_is) {
     EXPECT_EQ(alloc_entries(0, 4), failed(XCP_ERROR_MEMORY_OVERFLOW));
     ASSERT_EQ(alloc_entries(0, 3), DONE);
     EXPECT_EQ(alloc_entries(1, 1), failed(XCP_ERROR_MEMORY_OVERFLOW));
-    for (const auto &[odt, entry] : {std::pair<unsigned, unsigned>{0, 3}, {1, 0}, {2, 5}, {3, 0}, {255, 255}, {0, 255}}) {
+    for (const auto &[odt, entry] :
+         {std::pair<unsigned, unsigned>{0, 3}, {1, 0}, {2, 5}, {3, 0}, {255, 255}, {0, 255}}) {
         EXPECT_EQ(set_pointer(odt, entry), failed(XCP_ERROR_OUT_OF_RANGE)) << odt << " " << entry;
     }
     EXPECT_EQ(set_pointer(0, 0, 1), failed(XCP_ERROR_OUT_OF_RANGE));
@@ -299,7 +300,7 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
         const unsigned divider = unsigned(random() % 4 == 0 ? 255 : 1 + random() % 3);
         configure(odts, timestamps, at - 1u, divider);
         ASSERT_EQ(start_stop(1), (bytes_t{0xFF, 0}));
-        std::vector<std::vector<bytes_t>> expected; // frames of each record
+        std::vector<std::vector<bytes_t>> expected;      // frames of each record
         const uint32_t loss = seed % 30 == 0 ? 6000 : 0; // events before the first frame is sent
         size_t record = 0, odt = 0;
         for (uint32_t k = 0; k < 600 + loss; k++) {

@@ -114,8 +114,9 @@ class XcpFuzz : public XcpBench {
 
     // A buffer that waits, likewise.
     void arm() {
-        const uint32_t values[] = {1 + any(3),  1 + any(3), any(100), any(SAMPLER_CONDITIONS), any(5), 4 * any(DRIVE_WORDS), any(32),
-                                   any(32), any(2), 1 + any(8)};
+        const uint32_t values[] = {
+            1 + any(3), 1 + any(3), any(100),  any(SAMPLER_CONDITIONS), any(5), 4 * any(DRIVE_WORDS), any(32),
+            any(32),    any(2),     1 + any(8)};
         for (unsigned i = 0; i < XCP_SCOPE_WORDS; i++) {
             check(bytes_t{0xF6, 0, 0, 0} + word(XCP_AREA_SCOPE + 4 * ((i + 1) % XCP_SCOPE_WORDS)));
             const uint32_t value = i < 10 ? values[i] : 4 * any(DRIVE_WORDS);
@@ -130,8 +131,8 @@ class XcpFuzz : public XcpBench {
         const uint32_t address = xcp.address;
         const bytes_t response = command.size() > 8 ? (sent_long(command), bytes_t{}) : send(command);
         const uint8_t code = command.empty() ? 0 : command[0];
-        ASSERT_EQ(response.empty(), command.empty() || command.size() > 8 ||
-                                        (!connected && (code != 0xFF || command.size() < 2)));
+        ASSERT_EQ(response.empty(),
+                  command.empty() || command.size() > 8 || (!connected && (code != 0xFF || command.size() < 2)));
         const bool done = !response.empty() && response[0] == 0xFF;
         ASSERT_TRUE(response.empty() || done || (response[0] == 0xFE && response.size() == 2));
         follow_locks(command, done, response);
@@ -198,7 +199,8 @@ class XcpFuzz : public XcpBench {
         }
         completed += drive->sampler.state == SAMPLER_COMPLETE;
         conditions.running = rarely(200) ? !conditions.running : conditions.running;
-        drive->comms.set.begun = rarely(drive->comms.set.begun ? 10 : 200) ? !drive->comms.set.begun : drive->comms.set.begun;
+        drive->comms.set.begun =
+            rarely(drive->comms.set.begun ? 10 : 200) ? !drive->comms.set.begun : drive->comms.set.begun;
         if (rarely(1000)) {
             time_us += rarely(2) ? XCP_SILENT_US + 1 : 0x80000000u;
         }

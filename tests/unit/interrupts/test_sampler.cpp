@@ -160,9 +160,11 @@ class Course {
             word = 1664525u * word + uint32_t(random_());
         }
         const int64_t value = random_() % 50 == 0 ? level_ : level_ - spread_ + int64_t(random_() % (2 * spread_ + 1));
-        const bool rare = random_() % 400 != 0 && (setup_.condition == SAMPLER_EQUAL || setup_.condition == SAMPLER_CHANGED);
-        value_ = rare ? std::max(part_.least(), std::min(part_.most(), level_ == part_.most() ? level_ - 1 : level_ + 1))
-                      : std::max(part_.least(), std::min(part_.most(), value));
+        const bool rare =
+            random_() % 400 != 0 && (setup_.condition == SAMPLER_EQUAL || setup_.condition == SAMPLER_CHANGED);
+        value_ = rare
+                     ? std::max(part_.least(), std::min(part_.most(), level_ == part_.most() ? level_ - 1 : level_ + 1))
+                     : std::max(part_.least(), std::min(part_.most(), value));
         part_.set(memory_[setup_.variable.word], value_);
         EXPECT_EQ(part_.of(memory_[setup_.variable.word]), value_);
     }
@@ -259,9 +261,11 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
         EXPECT_EQ(std::memcmp(&before, &sampler, sizeof before), 0) << name;
     };
     for (const bool streams : {false, true}) {
-        refuses("no channel", [](auto &s) { s.channels = 0; }, streams);
+        refuses(
+            "no channel", [](auto &s) { s.channels = 0; }, streams);
         for (unsigned channels = SAMPLER_CHANNELS_MAX + 1; channels < 256; channels++) {
-            refuses("channels", [&](auto &s) { s.channels = uint8_t(channels); }, streams);
+            refuses(
+                "channels", [&](auto &s) { s.channels = uint8_t(channels); }, streams);
         }
         for (unsigned i = 0; i < SAMPLER_CHANNELS_MAX; i++) {
             for (const unsigned word : {WORDS, 65535u}) {
@@ -274,13 +278,20 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
                     streams);
             }
         }
-        refuses("event 0", [](auto &s) { s.event = sampler_event_t(0); }, streams);
-        refuses("event 4", [](auto &s) { s.event = sampler_event_t(4); }, streams);
-        refuses("divider", [](auto &s) { s.divider = 0; }, streams);
-        refuses("condition", [](auto &s) { s.condition = SAMPLER_CONDITIONS; }, streams);
-        refuses("variable", [](auto &s) { s.variable.word = WORDS; }, streams);
-        refuses("left", [](auto &s) { s.variable.left = 32; }, streams);
-        refuses("right", [](auto &s) { s.variable.right = 255; }, streams);
+        refuses(
+            "event 0", [](auto &s) { s.event = sampler_event_t(0); }, streams);
+        refuses(
+            "event 4", [](auto &s) { s.event = sampler_event_t(4); }, streams);
+        refuses(
+            "divider", [](auto &s) { s.divider = 0; }, streams);
+        refuses(
+            "condition", [](auto &s) { s.condition = SAMPLER_CONDITIONS; }, streams);
+        refuses(
+            "variable", [](auto &s) { s.variable.word = WORDS; }, streams);
+        refuses(
+            "left", [](auto &s) { s.variable.left = 32; }, streams);
+        refuses(
+            "right", [](auto &s) { s.variable.right = 255; }, streams);
     }
     for (unsigned channels = 1; channels <= SAMPLER_CHANNELS_MAX; channels++) {
         const unsigned most = SAMPLER_WORDS / channels - 2;
@@ -449,8 +460,14 @@ TEST(SamplerCorrupted, members_that_changed_in_memory_lead_nowhere_outside_the_r
                                    &sampler.missing,      &sampler.following, &sampler.countdown,
                                    &sampler.written,      &sampler.taken,     &sampler.taken_place};
         for (uint32_t *member : whole) {
-            const uint32_t any[] = {0, 1, SAMPLER_WORDS - 1, SAMPLER_WORDS, 0xFFFFFFFFu, uint32_t(0xFFFFFFFFu - random() % 20),
-                                    uint32_t(random()), *member ^ 1u << random() % 32};
+            const uint32_t any[] = {0,
+                                    1,
+                                    SAMPLER_WORDS - 1,
+                                    SAMPLER_WORDS,
+                                    0xFFFFFFFFu,
+                                    uint32_t(0xFFFFFFFFu - random() % 20),
+                                    uint32_t(random()),
+                                    *member ^ 1u << random() % 32};
             *member = random() % 3 == 0 ? any[random() % 8] : *member;
         }
         sampler.setup.channels = uint8_t(random() % 2 ? random() : sampler.setup.channels);
