@@ -64,51 +64,49 @@ void xcp_daq_stop(xcp_t *xcp) {
     xcp->daq.next_odt = xcp->daq.odts;
 }
 
-/* The commands that allocate come in this order; before one comes again, all is freed. */
-static xcp_error_t allocate(xcp_daq_t *daq, const uint8_t *command) {
-    const unsigned list = half_word(command + 2);
-    switch (command[0]) {
-    case FREE_DAQ:
-        *daq = (xcp_daq_t){0};
-        return XCP_ERROR_NONE;
-    case ALLOC_DAQ:
-        if (daq->allocated != XCP_DAQ_FREE) {
-            return XCP_ERROR_SEQUENCE;
-        }
-        if (list > 1) {
-            return XCP_ERROR_MEMORY_OVERFLOW;
-        }
-        daq->allocated = list == 1 ? XCP_DAQ_LIST : XCP_DAQ_FREE;
-        return XCP_ERROR_NONE;
-    case ALLOC_ODT:
-        if (daq->allocated != XCP_DAQ_LIST) {
-            return XCP_ERROR_SEQUENCE;
-        }
-        if (list != 0 || command[4] == 0 || command[4] > XCP_ODTS_MAX) {
-            return list != 0 ? XCP_ERROR_OUT_OF_RANGE : XCP_ERROR_MEMORY_OVERFLOW;
-        }
-        daq->odts = command[4];
-        daq->allocated = XCP_DAQ_ODTS;
-        return XCP_ERROR_NONE;
-    case ALLOC_ODT_ENTRY:
-    default:
-        if (daq->allocated < XCP_DAQ_ODTS) {
-            return XCP_ERROR_SEQUENCE;
-        }
-        if (list != 0 || command[4] >= daq->odts) {
-            return XCP_ERROR_OUT_OF_RANGE;
-        }
-        if (daq->odt[command[4]].end != 0) {
-            return XCP_ERROR_SEQUENCE;
-        }
-        if (command[5] > SAMPLER_CHANNELS_MAX - daq->entries) {
-            return XCP_ERROR_MEMORY_OVERFLOW;
-        }
-        daq->odt[command[4]] = (xcp_odt_t){daq->entries, (uint8_t)(daq->entries + command[5])};
-        daq->entries = (uint8_t)(daq->entries + command[5]);
-        daq->allocated = XCP_DAQ_ENTRIES;
-        return XCP_ERROR_NONE;
+static xcp_error_t allocate_list(xcp_daq_t *daq, unsigned lists) {
+    if (daq->allocated != XCP_DAQ_FREE) {
+        return XCP_ERROR_SEQUENCE;
     }
+    if (lists > 1) {
+        return XCP_ERROR_MEMORY_OVERFLOW;
+    }
+    daq->allocated = lists == 1 ? XCP_DAQ_LIST : XCP_DAQ_FREE;
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t allocate_odts(xcp_daq_t *daq, unsigned list, uint8_t odts) {
+    if (daq->allocated != XCP_DAQ_LIST) {
+        return XCP_ERROR_SEQUENCE;
+    }
+    if (list != 0) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    if (odts == 0 || odts > XCP_ODTS_MAX) {
+        return XCP_ERROR_MEMORY_OVERFLOW;
+    }
+    daq->odts = odts;
+    daq->allocated = XCP_DAQ_ODTS;
+    return XCP_ERROR_NONE;
+}
+
+static xcp_error_t allocate_entries(xcp_daq_t *daq, unsigned list, uint8_t odt, uint8_t entries) {
+    if (daq->allocated < XCP_DAQ_ODTS) {
+        return XCP_ERROR_SEQUENCE;
+    }
+    if (list != 0 || odt >= daq->odts) {
+        return XCP_ERROR_OUT_OF_RANGE;
+    }
+    if (daq->odt[odt].end != 0) {
+        return XCP_ERROR_SEQUENCE;
+    }
+    if (entries > SAMPLER_CHANNELS_MAX - daq->entries) {
+        return XCP_ERROR_MEMORY_OVERFLOW;
+    }
+    daq->odt[odt] = (xcp_odt_t){daq->entries, (uint8_t)(daq->entries + entries)};
+    daq->entries = (uint8_t)(daq->entries + entries);
+    daq->allocated = XCP_DAQ_ENTRIES;
+    return XCP_ERROR_NONE;
 }
 
 static xcp_error_t set_pointer(xcp_daq_t *daq, const uint8_t *command) {
@@ -270,17 +268,47 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
     }
 }
 
+/* The commands that allocate come in the order FREE_DAQ, ALLOC_DAQ, ALLOC_ODT, ALLOC_ODT_ENTRY; before one comes
+ * again, all is freed. */
+static xcp_error_t set_up(xcp_t *xcp, const uint8_t *command) {
+    xcp_daq_t *daq = &xcp->daq;
+    switch (command[0]) {
+    case SET_DAQ_PTR:
+        return set_pointer(daq, command);
+    case WRITE_DAQ:
+        return write_entry(xcp, command);
+    case SET_DAQ_LIST_MODE:
+        return set_mode(daq, command);
+    case FREE_DAQ:
+        xcp_daq_stop(xcp);
+        *daq = (xcp_daq_t){0};
+        return XCP_ERROR_NONE;
+    case ALLOC_DAQ:
+        return allocate_list(daq, half_word(command + 2));
+    case ALLOC_ODT:
+        return allocate_odts(daq, half_word(command + 2), command[4]);
+    case ALLOC_ODT_ENTRY:
+        return allocate_entries(daq, half_word(command + 2), command[4], command[5]);
+    default:
+        return XCP_ERROR_UNKNOWN;
+    }
+}
+
+static bool only_describes(uint8_t code) {
+    return code == GET_DAQ_PROCESSOR_INFO || code == GET_DAQ_RESOLUTION_INFO || code == GET_DAQ_EVENT_INFO ||
+           code == GET_DAQ_LIST_INFO || code == GET_DAQ_LIST_MODE || code == GET_DAQ_CLOCK;
+}
+
 xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, uint8_t *response, uint8_t *length) {
     const uint8_t code = command[0];
-    if (code >= ALLOC_ODT_ENTRY && code <= CLEAR_DAQ_LIST && bytes < least_bytes[code - ALLOC_ODT_ENTRY]) {
-        return XCP_ERROR_SYNTAX;
-    }
-    if (code == GET_DAQ_PROCESSOR_INFO || code == GET_DAQ_RESOLUTION_INFO || code == GET_DAQ_EVENT_INFO ||
-        code == GET_DAQ_LIST_INFO || code == GET_DAQ_LIST_MODE || code == GET_DAQ_CLOCK) {
-        return describe(xcp, command, response, length);
-    }
     if (code < ALLOC_ODT_ENTRY || code > CLEAR_DAQ_LIST) {
         return XCP_ERROR_UNKNOWN;
+    }
+    if (bytes < least_bytes[code - ALLOC_ODT_ENTRY]) {
+        return XCP_ERROR_SYNTAX;
+    }
+    if (only_describes(code)) {
+        return describe(xcp, command, response, length);
     }
     if ((xcp->unlocked & XCP_RESOURCE_DAQ) == 0) {
         return XCP_ERROR_ACCESS_LOCKED;
@@ -291,23 +319,7 @@ xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, 
     if (xcp->daq.running && code != FREE_DAQ) {
         return XCP_ERROR_DAQ_ACTIVE;
     }
-    switch (code) {
-    case SET_DAQ_PTR:
-        return set_pointer(&xcp->daq, command);
-    case WRITE_DAQ:
-        return write_entry(xcp, command);
-    case SET_DAQ_LIST_MODE:
-        return set_mode(&xcp->daq, command);
-    case FREE_DAQ:
-        xcp_daq_stop(xcp);
-        return allocate(&xcp->daq, command);
-    case ALLOC_DAQ:
-    case ALLOC_ODT:
-    case ALLOC_ODT_ENTRY:
-        return allocate(&xcp->daq, command);
-    default:
-        return XCP_ERROR_UNKNOWN;
-    }
+    return set_up(xcp, command);
 }
 
 bool xcp_daq_next_frame(xcp_t *xcp, hal_can_frame_t *frame) {
