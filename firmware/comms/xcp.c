@@ -42,15 +42,16 @@ typedef struct {
 } message_t;
 
 /* Bytes of a command without data and keys of a count of its own; 0: one byte, or a command of xcp_daq.h. */
-static const uint8_t least_bytes[] = {
-    [DOWNLOAD - DOWNLOAD] = 2,    [SHORT_UPLOAD - DOWNLOAD] = 8, [UPLOAD - DOWNLOAD] = 2,
-    [SET_MTA - DOWNLOAD] = 8,     [UNLOCK - DOWNLOAD] = 2,       [GET_SEED - DOWNLOAD] = 3,
-    [SET_REQUEST - DOWNLOAD] = 4, [GET_ID - DOWNLOAD] = 2,       [CONNECT - DOWNLOAD] = 2,
+#define COMMAND_INDEX 0x0F /* of a code from DOWNLOAD on */
+static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
+    [DOWNLOAD & COMMAND_INDEX] = 2,    [SHORT_UPLOAD & COMMAND_INDEX] = 8, [UPLOAD & COMMAND_INDEX] = 2,
+    [SET_MTA & COMMAND_INDEX] = 8,     [UNLOCK & COMMAND_INDEX] = 2,       [GET_SEED & COMMAND_INDEX] = 3,
+    [SET_REQUEST & COMMAND_INDEX] = 4, [GET_ID & COMMAND_INDEX] = 2,       [CONNECT & COMMAND_INDEX] = 2,
 };
 
 static bool is_whole(const uint8_t *command, unsigned bytes) {
     const bool counted = command[0] == DOWNLOAD || command[0] == UNLOCK;
-    const unsigned least = command[0] < DOWNLOAD ? 0 : least_bytes[command[0] - DOWNLOAD];
+    const unsigned least = command[0] < DOWNLOAD ? 0 : least_bytes[command[0] & COMMAND_INDEX];
     return bytes >= least + (counted ? fixed_min_u32(command[1], DOWNLOAD_BYTES) : 0);
 }
 

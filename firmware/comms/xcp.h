@@ -108,7 +108,7 @@ typedef struct {
     char text[XCP_TEXT_BYTES];
 } xcp_t;
 
-/* What a command may act on. */
+/* Objects on which a command may act. */
 typedef struct {
     parameters_t *parameters;
     const parameters_conditions_t *conditions;

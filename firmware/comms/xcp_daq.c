@@ -33,14 +33,15 @@ enum { FIRST_BYTES = 7, TIMESTAMP_BYTES = 2 };
 #define TIMESTAMP_MODE (TIMESTAMP_BYTES | 3u << 4)
 #define EVENT_PROPERTIES 0x04u /* of DAQ */
 
-/* Bytes of a command; 0: one. */
-static const uint8_t least_bytes[CLEAR_DAQ_LIST - ALLOC_ODT_ENTRY + 1] = {
-    [ALLOC_ODT_ENTRY - ALLOC_ODT_ENTRY] = 6,     [ALLOC_ODT - ALLOC_ODT_ENTRY] = 5,
-    [ALLOC_DAQ - ALLOC_ODT_ENTRY] = 4,           [GET_DAQ_EVENT_INFO - ALLOC_ODT_ENTRY] = 4,
-    [GET_DAQ_LIST_INFO - ALLOC_ODT_ENTRY] = 4,   [START_STOP_SYNCH - ALLOC_ODT_ENTRY] = 2,
-    [START_STOP_DAQ_LIST - ALLOC_ODT_ENTRY] = 4, [GET_DAQ_LIST_MODE - ALLOC_ODT_ENTRY] = 4,
-    [SET_DAQ_LIST_MODE - ALLOC_ODT_ENTRY] = 7,   [WRITE_DAQ - ALLOC_ODT_ENTRY] = 8,
-    [SET_DAQ_PTR - ALLOC_ODT_ENTRY] = 6,
+/* Bytes of a command, whose code is unique in its lower five bits; 0: one. */
+#define COMMAND_INDEX 0x1F
+static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
+    [ALLOC_ODT_ENTRY & COMMAND_INDEX] = 6,     [ALLOC_ODT & COMMAND_INDEX] = 5,
+    [ALLOC_DAQ & COMMAND_INDEX] = 4,           [GET_DAQ_EVENT_INFO & COMMAND_INDEX] = 4,
+    [GET_DAQ_LIST_INFO & COMMAND_INDEX] = 4,   [START_STOP_SYNCH & COMMAND_INDEX] = 2,
+    [START_STOP_DAQ_LIST & COMMAND_INDEX] = 4, [GET_DAQ_LIST_MODE & COMMAND_INDEX] = 4,
+    [SET_DAQ_LIST_MODE & COMMAND_INDEX] = 7,   [WRITE_DAQ & COMMAND_INDEX] = 8,
+    [SET_DAQ_PTR & COMMAND_INDEX] = 6,
 };
 
 static uint16_t half_word(const uint8_t *at) {
@@ -304,7 +305,7 @@ xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, 
     if (code < ALLOC_ODT_ENTRY || code > CLEAR_DAQ_LIST) {
         return XCP_ERROR_UNKNOWN;
     }
-    if (bytes < least_bytes[code - ALLOC_ODT_ENTRY]) {
+    if (bytes < least_bytes[code & COMMAND_INDEX]) {
         return XCP_ERROR_SYNTAX;
     }
     if (only_describes(code)) {

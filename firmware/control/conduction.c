@@ -60,8 +60,7 @@ static conduction_place_t place_of(const machine_tables_t *tables, const conduct
     return (conduction_place_t){index_q8 >> 8, (int32_t)(index_q8 & 0xFF)};
 }
 
-/* Point of a place that an earlier step has found: one that has changed in memory is the last with another behind it.
- */
+/* Point of a place that an earlier step has found; one that has changed in memory is within the tables. */
 static unsigned point_of(conduction_place_t place) {
     return fixed_min_u32(place.k, MACHINE_PULSE_POINTS - 2);
 }
@@ -104,11 +103,6 @@ static void look_up(conduction_state_t *state, conduction_update_t *update, cons
     state->braking = braking;
 }
 
-/* CONDUCTION_MOTORING or CONDUCTION_BRAKING, whatever has changed in memory. */
-static unsigned half_of(const conduction_state_t *state) {
-    return state->braking != 0 ? CONDUCTION_BRAKING : CONDUCTION_MOTORING;
-}
-
 /* At the level 0 and 1 within 2 LSB of from and to. */
 static uint32_t blend(uint32_t from, uint32_t to, int32_t level_q15) {
     return from + 4 * (uint32_t)fixed_multiply_high((int32_t)(to - from), level_q15 << 15);
@@ -131,8 +125,8 @@ static conduction_sharing_t sharing_for_torque(const machine_tables_t *tables, c
     const int32_t place_q8 = fixed_clamp(quarters_q8 - ONE_Q8, 0, (MACHINE_SHARING_PARTS - 1) * ONE_Q8);
     const int32_t k = place_q8 < (MACHINE_SHARING_PARTS - 1) * ONE_Q8 ? place_q8 >> 8 : MACHINE_SHARING_PARTS - 2;
     const int32_t part_q8 = place_q8 - k * ONE_Q8;
-    const machine_sharing_window_t *still = &tables->sharing[half_of(state)][0][k];
-    const machine_sharing_window_t *base = &tables->sharing[half_of(state)][1][k];
+    const machine_sharing_window_t *still = &tables->sharing[conduction_half_of(state)][0][k];
+    const machine_sharing_window_t *base = &tables->sharing[conduction_half_of(state)][1][k];
     return (conduction_sharing_t){
         .on = (uint32_t)between_windows(still[0].on, still[1].on, base[0].on, base[1].on, part_q8, speed_q8) << 8,
         .off = (uint32_t)between_windows(still[0].off, still[1].off, base[0].off, base[1].off, part_q8, speed_q8) << 8,
@@ -447,9 +441,8 @@ static void set_angles(const conduction_parameters_t *parameters, conduction_sta
     const int32_t level_q15 = state->level_q15;
     const unsigned next = state->latest == 0 ? 1 : 0;
     conduction_t *angles = &state->angles[next];
-    const unsigned own = half_of(state);
-    conduction_half_t *half = &angles->half[own];
-    conduction_half_t *before = &angles->half[own ^ 1u];
+    conduction_half_t *half = &angles->half[conduction_half_of(state)];
+    conduction_half_t *before = &angles->half[conduction_half_of(state) ^ 1u];
     const uint32_t on = update->interval.on;
     angles->ripple_q24 = negative ? fixed_subtract(0, update->ripple_q24) : update->ripple_q24;
     before->window = parameters->initial.half[0].window;
@@ -493,7 +486,7 @@ void conduction_step(const conduction_parameters_t *parameters, conduction_state
         state->above_base_q15 = above_base_q15(tables, update->place);
         state->partial_q15 = parameters->single_pulse ? state->above_base_q15 : 0;
         if (state->partial_q15 > 0) {
-            update->partial = partial_pulse(tables, update, half_of(state), state->part_q15);
+            update->partial = partial_pulse(tables, update, conduction_half_of(state), state->part_q15);
         }
         break;
     case CONDUCTION_POSITIONS:

@@ -244,6 +244,11 @@ static inline void conduction_reset(const conduction_parameters_t *parameters, c
 void conduction_step(const conduction_parameters_t *parameters, conduction_state_t *state, conduction_update_t *update,
                      const machine_tables_t *tables, const conduction_sample_t *sample);
 
+/* CONDUCTION_MOTORING or CONDUCTION_BRAKING, whatever has changed in memory. */
+static inline unsigned conduction_half_of(const conduction_state_t *state) {
+    return state->braking != 0 ? CONDUCTION_BRAKING : CONDUCTION_MOTORING;
+}
+
 /* Angles of the update with an index. */
 static inline const conduction_t *conduction_angles(const conduction_parameters_t *parameters,
                                                     const conduction_state_t *state, unsigned index) {

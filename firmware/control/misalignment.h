@@ -135,7 +135,7 @@ typedef struct {
 
 misalignment_parameters_t misalignment_configure(const misalignment_settings_t *settings);
 
-/* The phase of the next step. An index that has changed in memory is none beyond the phases. */
+/* The phase of the next step. An index that has changed in memory stays within the array. */
 static inline unsigned misalignment_phase_index(const misalignment_t *misalignment) {
     return misalignment->phase_index % HAL_PHASES_MAX;
 }

@@ -29,7 +29,8 @@ static int32_t multiply_q30(int32_t value, int32_t factor_q30) {
 }
 
 COLD void table_scale_reset(table_scale_t *scale) {
-    *scale = (table_scale_t){.scale_q30 = TABLE_SCALE_ONE_Q30, .smooth_q30 = TABLE_SCALE_ONE_Q30};
+    *scale = (table_scale_t){
+        .scale_q30 = TABLE_SCALE_ONE_Q30, .smooth_q30 = TABLE_SCALE_ONE_Q30, .smooth_complement = ~TABLE_SCALE_ONE_Q30};
 }
 
 COLD table_scale_factors_t table_scale_factors(int32_t scale_q30, int32_t period_q40,
@@ -186,7 +187,10 @@ COLD void table_scale_follow(table_scale_t *scale, int32_t factor_q30, int32_t p
     const int32_t found_q30 = differs ? scale->scale_q30 : TABLE_SCALE_ONE_Q30;
     const int32_t target_q30 =
         fixed_clamp(multiply_q30(found_q30, factor_q30), TABLE_SCALE_MIN_Q30, TABLE_SCALE_MAX_Q30);
-    scale->smooth_q30 += fixed_multiply(fixed_subtract(target_q30, scale->smooth_q30), part_q31, 31);
+    const bool intact = scale->smooth_q30 == ~scale->smooth_complement;
+    const int32_t smooth_q30 = intact ? scale->smooth_q30 : TABLE_SCALE_ONE_Q30;
+    scale->smooth_q30 = smooth_q30 + fixed_multiply(fixed_subtract(target_q30, smooth_q30), part_q31, 31);
+    scale->smooth_complement = ~scale->smooth_q30;
     scale->smooth_resistance_q40 +=
         fixed_multiply(fixed_subtract(scale->resistance_q40, scale->smooth_resistance_q40), part_q31 / 4, 31);
 }

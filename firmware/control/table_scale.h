@@ -55,7 +55,7 @@ typedef struct {
     int64_t square_q18;                    /* of i^2, A^2 periods */
 } table_scale_phase_t;
 
-/* All zero but for `scale_q30` and `smooth_q30`, 1, at the start. */
+/* All zero but for `scale_q30` and `smooth_q30`, 1, and its complement at the start. */
 typedef struct {
     table_scale_phase_t phase[HAL_PHASES_MAX];
     int64_t applied_q30, table_q30, square_q10; /* sums of (2) */
@@ -64,6 +64,7 @@ typedef struct {
     uint32_t intervals;                         /* since the start, at most TABLE_SCALE_INTERVALS_MIN */
     int32_t scale_q30;                          /* s of the sums, Q1.30 */
     int32_t smooth_q30;                         /* that follows it, Q1.30 */
+    int32_t smooth_complement;                  /* of its bits: a scale that has changed in memory begins anew at 1 */
     int32_t resistance_q40;                     /* (R - R0) Ts of the sums, ohm s, Q-9.40 */
     int32_t smooth_resistance_q40;              /* that follows it */
 } table_scale_t;

@@ -55,7 +55,7 @@ typedef struct {
     uint8_t channels;                    /* 1..SAMPLER_CHANNELS_MAX */
     sampler_event_t event;
     uint16_t divider; /* events for each record, at least 1 */
-    /* Of the triggered buffer: */
+    /* For the triggered buffer: */
     uint16_t before; /* records before the trigger */
     sampler_condition_t condition;
     sampler_variable_t variable;

@@ -83,7 +83,7 @@ static void check_constants(self_test_t *test, const control_parameters_t *param
     }
 }
 
-/* A word beyond the last one, as one of the stack below, is none that a pass comes to: it has changed in memory. */
+/* No pass comes to a word beyond the last one, as below to one beyond the stack: its number has changed in memory. */
 static void check_code(self_test_t *test, const hal_memory_t *memory) {
     for (unsigned i = 0; i < CODE_SLICE && test->crc_word < memory->code_words; i++) {
         test->crc = crc32_continue(test->crc, &memory->code[test->crc_word++], sizeof(uint32_t));

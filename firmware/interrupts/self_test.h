@@ -60,7 +60,7 @@ void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us);
 void self_test_configured(self_test_t *test, const control_parameters_t *parameters);
 
 /* False when number, mask and state of the latched fault contradict each other, a state other than run the duties, or
- * when the state is none.
+ * when the state has no name.
  * [background, in a critical section] */
 bool self_test_latch_intact(const control_state_t *control);
 

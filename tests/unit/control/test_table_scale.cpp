@@ -388,4 +388,14 @@ TEST(TableScaleFollow, the_resistance_follows_by_a_quarter_of_the_part_by_which_
     EXPECT_NEAR(state.smooth_resistance_q40 / double(1 << 20), 1.0 - std::exp(-0.25), 0.01);
 }
 
+TEST(TableScaleInMemory, a_scale_of_which_a_bit_has_changed_begins_anew) {
+    for (unsigned bit = 0; bit < 32; bit++) {
+        table_scale_t scale;
+        table_scale_reset(&scale);
+        scale.smooth_q30 = int32_t(uint32_t(scale.smooth_q30) ^ UINT32_C(1) << bit);
+        table_scale_follow(&scale, TABLE_SCALE_ONE_Q30, 1 << 10);
+        EXPECT_EQ(scale.smooth_q30, TABLE_SCALE_ONE_Q30) << bit;
+    }
+}
+
 } // namespace

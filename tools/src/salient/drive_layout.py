@@ -21,7 +21,7 @@ _SIGNED = {5, 6}
 
 
 def layout_file(build: str = "host") -> Path:
-    """Of a build, as a file for Layout."""
+    """The layout of a build, as a file for Layout."""
     return BUILD / build / "firmware" / "drive_layout.elf"
 
 

@@ -22,7 +22,7 @@ from salient.machine.path import machine_path
 from salient.machine.scaling import Scaling, database_of, scaling_of
 
 ELEMENTS_MAX = 16
-"""Of an array; the members of longer ones, as the rings of traces, are no signals."""
+"""Limit of an array; the members of longer ones, as the rings of traces, are no signals."""
 BIT_RATE = 1_000_000
 EVENTS = ("control", "deferred", "background")
 _WORD_BYTES = 4

@@ -36,7 +36,7 @@ TIMEOUT_S = 1.0
 _COMMANDS = {"stop": 0, "arm": 1, "trigger": 2}
 _WORDS = ("command", "event", "divider", "before", "condition", "level", "variable", "left", "right", "signed",
           "channels", "channel")
-"""Of the area of XCP, as xcp_scope_word_t; the last is the first of CHANNELS_MAX."""
+"""Words in the area of XCP, as xcp_scope_word_t; the last is the first of CHANNELS_MAX."""
 _AT_ONCE, _AT_LEAST, _AT_MOST, _RISING, _FALLING, _EQUAL, _CHANGED = range(7)
 """sampler_condition_t."""
 _WORD_BYTES, _LEVEL_MAX, _WORD_BITS = 4, 2**31 - 1, 32
@@ -109,7 +109,7 @@ def _common_prefix(names: Mapping[str, int]) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """What the buffer had. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of the
+    """Contents of the buffer. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of the
     values of enumerations."""
 
     time_s: np.ndarray

@@ -69,7 +69,7 @@ class Variables:
 
     @property
     def paths(self) -> Collection[str]:
-        """Of all."""
+        """Paths of all variables."""
         return self._variables.keys()
 
     def quantities(self) -> Iterator[Quantity]:

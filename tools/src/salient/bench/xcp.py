@@ -30,7 +30,7 @@ COMMAND_ID, RESPONSE_ID = (drive_database().get_message_by_name(name).frame_id
 AREA_PARAMETERS, AREA_SCOPE, AREA_TEXT = 0x10000000, 0x20000000, 0x30000000
 """Addresses of firmware/comms/xcp.h; the drive's memory begins at 0."""
 RESPONSE_TIMEOUT_S = 2.0
-"""Of a session whose time moves by itself, which reads what came before the response first."""
+"""Long enough for a session whose time moves by itself, which reads what came before the response first."""
 _POLL_NS = 100_000
 _UPLOAD, _DATA_BYTES = 0xF5, 7
 _RESPONSE, _FIRST_OF_RESPONSES = 0xFF, 0xFC
@@ -55,7 +55,7 @@ class SessionInterface:
 
     @property
     def identifiers(self) -> tuple[int, int]:
-        """Of the commands and of the responses."""
+        """Identifiers of the commands and of the responses."""
         return self._command_id, self._response_id
 
     def set_filters(self, filters: list[dict[str, Any]] | None = None) -> None:
