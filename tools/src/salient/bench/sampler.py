@@ -109,8 +109,8 @@ def _common_prefix(names: Mapping[str, int]) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """Contents of the buffer. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of the
-    values of enumerations."""
+    """Contents of the buffer. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of
+    the values of enumerations."""
 
     time_s: np.ndarray
     values: Mapping[str, np.ndarray]
