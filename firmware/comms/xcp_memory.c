@@ -6,7 +6,7 @@
 
 typedef enum { SCOPE_STOP, SCOPE_ARM, SCOPE_TRIGGER, SCOPE_COMMANDS } scope_command_t;
 
-static const char event_names[XCP_EVENTS][XCP_TEXT_BYTES] = {"control", "deferred", "background"};
+static const char event_names[XCP_EVENTS][XCP_TEXT_BYTES] = {"control", "background"};
 
 typedef const volatile uint32_t MAY_ALIAS memory_word_t;
 

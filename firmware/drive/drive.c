@@ -1,5 +1,7 @@
 #include "drive/drive.h"
 
+#include <string.h>
+
 #include "comms/node.h"
 #include "drive/background_checks.h"
 #include "drive/telemetry_collect.h"
@@ -55,9 +57,8 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
         config->control_rate_hz < machine_tables.control_rate_min_hz || config->node > NODE_MAX) {
         return false;
     }
-    *drive = (drive_t){
-        .processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz),
-    };
+    memset(drive, 0, sizeof *drive); /* a structure of this size as a value would be a copy on the stack */
+    drive->processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz);
     self_test_init(&drive->self_test, hal, hal_time_us(hal));
     temperature_init(&drive->temperature, hal_time_us(hal));
     parameters_init(&drive->parameters);
@@ -155,9 +156,6 @@ void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
         return;
     }
     deferred_compute(&drive->control_parameters, control, &drive->command);
-    if (drive->sampler.event == SAMPLER_EVENT_DEFERRED) {
-        sampler_record(&drive->sampler, drive, DRIVE_WORDS, hal_time_us(hal));
-    }
     drive->deferred_used_ticks = deferred_elapsed_ticks(drive, hal);
     if (drive->deferred_used_ticks > drive->deferred_worst_ticks) {
         drive->deferred_worst_ticks = drive->deferred_used_ticks;

@@ -21,7 +21,7 @@
 #define SAMPLER_WORDS 4096u
 #endif
 
-typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_DEFERRED, SAMPLER_EVENT_BACKGROUND } sampler_event_t;
+typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_BACKGROUND } sampler_event_t;
 
 typedef enum {
     SAMPLER_AT_ONCE,  /* at the next event */

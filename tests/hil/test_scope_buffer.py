@@ -153,7 +153,6 @@ def test_the_buffer_of_a_target_has_the_same_values_as_that_of_the_host(make_ben
     (["speed_rpm"], {"trigger": "speed_rpm > 1e6"}, "trigger 'speed_rpm > 1e6': speed_rpm is from -4889.24 to"),
     (["speed_rpm"], {"divider": 0}, "divider 0: must be a whole number from 1 to 65535"),
     (["speed_rpm"], {"before": 1.0}, "before 1.0: must be from 0 to below 1"),
-    (["speed_rpm"], {"event": "adc"}, "event 'adc': must be control or deferred"),
 ])
 def test_a_wrong_request_is_named_and_arms_nothing(bench, signals, options, error):
     with pytest.raises(UsageError, match=error.replace("(", r"\(")):

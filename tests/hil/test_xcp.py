@@ -32,8 +32,8 @@ def read(master, index):
 
 
 def raw_exchange(bench, *data):
-    """The response to one command, without a master."""
-    bench.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=bytes(data)))
+    """The response to one command, with zeros behind it, without a master."""
+    bench.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=bytes(data).ljust(8, b"\0")))
     seen = len(bench.log)
     bench.run_for(0.002)
     return [bytes(frame.data) for _, frame in bench.log[seen:] if frame.arbitration_id == RESPONSE_ID]

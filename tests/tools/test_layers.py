@@ -33,7 +33,7 @@ PYTHON_LAYERS = (
     "salient", "salient.guard", "salient.errors", "salient.paths", "salient.workers", "salient.progress",
     "salient.config", "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.exceptions",
     "salient.c_limits", "salient.language", "salient.turns",
-    "salient.cli", "salient.elf", "salient.vm", "salient.machine", "salient.finite_elements",
+    "salient.cli", "salient.elf", "salient.drive_layout", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
     "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",

@@ -1770,6 +1770,7 @@ TEST_F(Drive, the_scale_of_the_tables_that_has_been_found_takes_effect_in_the_in
     for (const double scale : {1.1, 0.9}) {
         drive.table_scale.differs = true;
         drive.table_scale.scale_q30 = drive.table_scale.smooth_q30 = int32_t(std::lround(scale * 0x1p30));
+        drive.table_scale.smooth_complement = ~drive.table_scale.smooth_q30;
         periods(10);
         EXPECT_NEAR(drive.control.table_scale.excess_q31 / 0x1p31, scale - 1.0, 1e-4);
         EXPECT_NEAR(drive.control.table_scale.inverse_excess_q31 / 0x1p31, 1.0 / scale - 1.0, 1e-4);

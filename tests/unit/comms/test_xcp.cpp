@@ -50,7 +50,7 @@ class Xcp : public XcpBench {
     }
 
     uint32_t areas[4] = {XCP_AREA_MEMORY, XCP_AREA_PARAMETERS, XCP_AREA_SCOPE, XCP_AREA_TEXT};
-    uint32_t sizes[4] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS, 128};
+    uint32_t sizes[4] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS, XCP_TEXT_BYTES *(1 + XCP_EVENTS)};
 };
 
 TEST_F(Xcp, answers_nothing_before_a_connect) {
@@ -134,14 +134,14 @@ TEST_F(Xcp, identifies_program_and_events_by_texts) {
     for (const unsigned type : {2, 3, 4, 6, 128, 255}) {
         EXPECT_EQ(send({0xFA, uint8_t(type)}), (bytes_t{0xFF, 0, 0, 0, 0, 0, 0, 0})) << "there is none";
     }
-    const char *names[] = {"control", "deferred", "background"};
-    for (unsigned event = 0; event < 3; event++) {
+    const char *names[] = {"control", "background"};
+    for (unsigned event = 0; event < 2; event++) {
         const std::string name = names[event];
         EXPECT_EQ(send({0xD7, 0, uint8_t(event), 0}), (bytes_t{0xFF, 0x04, 1, uint8_t(name.size()), 0, 0, 0}));
         const bytes_t text = upload(unsigned(name.size()));
         EXPECT_EQ(std::string(text.begin(), text.end()), name);
     }
-    EXPECT_EQ(send({0xD7, 0, 3, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
+    EXPECT_EQ(send({0xD7, 0, 2, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(send({0xD7, 0, 0, 1}), failed(XCP_ERROR_OUT_OF_RANGE));
 }
 
@@ -421,7 +421,7 @@ TEST_F(Xcp, stores_the_parameters_while_the_drive_does_not_run) {
 TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     open();
     const uint32_t setup[XCP_SCOPE_WORDS] = {
-        0, SAMPLER_EVENT_DEFERRED, 2, 100, SAMPLER_EQUAL, 0xFFFFFFFFu, 40, 16, 24, 1, 2, 8, 12};
+        0, SAMPLER_EVENT_BACKGROUND, 2, 100, SAMPLER_EQUAL, 0xFFFFFFFFu, 40, 16, 24, 1, 2, 8, 12};
     for (unsigned i = 1; i < XCP_SCOPE_WORDS; i++) {
         ASSERT_EQ(write(XCP_AREA_SCOPE + 4 * i, setup[i]), DONE);
         EXPECT_EQ(short_upload(XCP_AREA_SCOPE + 4 * i, 4), bytes_t{0xFF} + word(setup[i]));
@@ -454,13 +454,13 @@ TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     EXPECT_EQ(write(XCP_AREA_SCOPE, 1), DONE);
     const sampler_setup_t &armed = drive->sampler.setup;
     EXPECT_EQ(drive->sampler.state, SAMPLER_WAITS);
-    EXPECT_EQ(drive->sampler.event, uint32_t(SAMPLER_EVENT_DEFERRED));
+    EXPECT_EQ(drive->sampler.event, uint32_t(SAMPLER_EVENT_BACKGROUND));
     EXPECT_TRUE(armed.divider == 2 && armed.before == 100 && armed.condition == SAMPLER_EQUAL && armed.level == -1);
     EXPECT_TRUE(armed.variable.word == 10 && armed.variable.left == 16 && armed.variable.right == 24);
     EXPECT_TRUE(armed.variable.is_signed && armed.channels == 2 && armed.word[0] == 2 && armed.word[1] == 3);
     EXPECT_EQ(write(XCP_AREA_SCOPE, 2), DONE);
     while (drive->sampler.event != 0) {
-        event(SAMPLER_EVENT_DEFERRED);
+        event(SAMPLER_EVENT_BACKGROUND);
     }
     EXPECT_EQ(drive->sampler.state, SAMPLER_COMPLETE);
     EXPECT_EQ(write(XCP_AREA_SCOPE, 1), DONE);

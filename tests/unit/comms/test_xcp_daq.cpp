@@ -68,7 +68,7 @@ class XcpDaq : public XcpBench {
 };
 
 TEST_F(XcpDaq, describes_what_there_is) {
-    EXPECT_EQ(send({0xDA}), (bytes_t{0xFF, 0x13, 1, 0, 3, 0, 0, 0})) << "dynamic, prescaler, timestamps";
+    EXPECT_EQ(send({0xDA}), (bytes_t{0xFF, 0x13, 1, 0, XCP_EVENTS, 0, 0, 0})) << "dynamic, prescaler, timestamps";
     EXPECT_EQ(send({0xD9}), (bytes_t{0xFF, 1, 4, 1, 0, 0x32, 1, 0})) << "two bytes of 1 us";
     EXPECT_EQ(send({0xD8, 0, 0, 0}), (bytes_t{0xFF, 0x04, 8, 8, 0, 0}));
     EXPECT_EQ(send({0xD8, 0, 1, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
@@ -76,8 +76,8 @@ TEST_F(XcpDaq, describes_what_there_is) {
     EXPECT_EQ(send({0xDC}), (bytes_t{0xFF, 0, 0, 0, 0x78, 0x56, 0x34, 0x12}));
     EXPECT_EQ(send({0xDF, 0, 0, 0}), (bytes_t{0xFF, 0, 0, 0, 0, 0, 0, 0}));
     EXPECT_EQ(send({0xDF, 0, 0, 1}), failed(XCP_ERROR_OUT_OF_RANGE));
-    configure({{{0, 4}}}, true, 2, 200);
-    EXPECT_EQ(send({0xDF, 0, 0, 0}), (bytes_t{0xFF, 0x10, 0, 0, 2, 0, 200, 0}));
+    configure({{{0, 4}}}, true, 1, 200);
+    EXPECT_EQ(send({0xDF, 0, 0, 0}), (bytes_t{0xFF, 0x10, 0, 0, 1, 0, 200, 0}));
 }
 
 TEST_F(XcpDaq, is_allocated_in_order_only) {
@@ -129,7 +129,7 @@ TEST_F(XcpDaq, refuses_more_than_there_is) {
         EXPECT_EQ(set_pointer(odt, entry), failed(XCP_ERROR_OUT_OF_RANGE)) << odt << " " << entry;
     }
     EXPECT_EQ(set_pointer(0, 0, 1), failed(XCP_ERROR_OUT_OF_RANGE));
-    for (const unsigned event : {3, 256, 65535}) {
+    for (const unsigned event : {2, 256, 65535}) {
         EXPECT_EQ(set_mode(0, event, 1), failed(XCP_ERROR_OUT_OF_RANGE));
     }
     EXPECT_EQ(set_mode(0, 0, 0), failed(XCP_ERROR_OUT_OF_RANGE)) << "the prescaler is at least 1";
@@ -296,7 +296,7 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
         if (std::all_of(odts.begin(), odts.end(), [](const auto &odt) { return odt.empty(); })) {
             continue;
         }
-        const auto at = sampler_event_t(1 + random() % 3);
+        const auto at = sampler_event_t(1 + random() % XCP_EVENTS);
         const unsigned divider = unsigned(random() % 4 == 0 ? 255 : 1 + random() % 3);
         configure(odts, timestamps, at - 1u, divider);
         ASSERT_EQ(start_stop(1), (bytes_t{0xFF, 0}));
@@ -308,7 +308,7 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
             for (unsigned i = 0; i < 4 * WORDS; i++) {
                 bytes()[i] = uint8_t(random());
             }
-            for (unsigned other = 1; other <= 3; other++) {
+            for (unsigned other = 1; other <= XCP_EVENTS; other++) {
                 const uint32_t written = drive->sampler.written;
                 event(sampler_event_t(other));
                 const bool due = other == unsigned(at) && k % divider == 0;

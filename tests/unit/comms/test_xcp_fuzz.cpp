@@ -18,7 +18,8 @@ class XcpFuzz : public XcpBench {
 
     uint32_t any_address() {
         const uint32_t begins[] = {XCP_AREA_MEMORY, XCP_AREA_PARAMETERS, XCP_AREA_SCOPE, XCP_AREA_TEXT};
-        const uint32_t sizes[] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS, 128};
+        const uint32_t sizes[] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS,
+                                  XCP_TEXT_BYTES * (1 + XCP_EVENTS)};
         const unsigned area = any(4);
         switch (any(8)) {
         case 0:

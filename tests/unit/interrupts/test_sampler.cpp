@@ -64,7 +64,7 @@ sampler_setup_t any_setup(std::mt19937 &random, const part_t &part, int64_t leve
     for (unsigned i = 0; i < setup.channels; i++) {
         setup.word[i] = uint16_t(random() % WORDS);
     }
-    setup.event = sampler_event_t(1 + random() % 3);
+    setup.event = sampler_event_t(1 + random() % 2);
     setup.divider = uint16_t(random() % 3 == 0 ? 1 : 1 + random() % 5);
     const unsigned most = SAMPLER_WORDS / setup.channels - 2;
     const unsigned kind = random() % 4;

@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from salient.bench.session import Session
 
 CHANNELS_MAX = 8
-EVENTS = {"control": 1, "deferred": 2}
 DIVIDER_MAX = 65_535
 TIMEOUT_S = 1.0
+_CONTROL = 1
+"""sampler_event_t."""
 _COMMANDS = {"stop": 0, "arm": 1, "trigger": 2}
 _WORDS = ("command", "event", "divider", "before", "condition", "level", "variable", "left", "right", "signed",
           "channels", "channel")
@@ -167,8 +168,8 @@ class Scope:
 
 
 def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
-        divider: int = 1, event: str = "control") -> Scope:
-    """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th event, from the part
+        divider: int = 1) -> Scope:
+    """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th control period, from the part
     `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on. UsageError: one of
     these is wrong; ScopeError: the drive's memory has another layout than the program here."""
     variables = variables_of(session)
@@ -176,7 +177,7 @@ def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *,
         raise UsageError(f"signals: must be 1 to {CHANNELS_MAX} names")
     quantities = [variables.quantity(name) for name in signals]
     condition = Trigger() if trigger is None else parse_trigger(trigger, variables)
-    _check(divider, before, event)
+    _check(divider, before)
     with connected(session) as master:
         _check_layout(master, variables)
         size = variables.layout.bits("sampler.ring")
@@ -184,7 +185,7 @@ def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *,
         records_before = min(int(before * capacity), capacity - 2)
         of = condition.quantity or quantities[0]
         first = of.variable.address % _WORD_BYTES
-        setup = {"event": EVENTS[event], "divider": divider, "before": records_before,
+        setup = {"event": _CONTROL, "divider": divider, "before": records_before,
                  "condition": condition.condition, "level": condition.level, "variable": of.variable.address,
                  "left": _WORD_BITS - 8 * (first + of.variable.bytes), "right": _WORD_BITS - 8 * of.variable.bytes,
                  "signed": of.variable.is_signed, "channels": len(quantities)}
@@ -196,9 +197,7 @@ def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *,
     return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider)
 
 
-def _check(divider: Any, before: Any, event: str) -> None:
-    if event not in EVENTS:
-        raise UsageError(f"event '{event}': must be {either(list(EVENTS))}")
+def _check(divider: Any, before: Any) -> None:
     if not isinstance(divider, int) or not 1 <= divider <= DIVIDER_MAX:
         raise UsageError(f"divider {shown(divider)}: must be a whole number from 1 to {DIVIDER_MAX}")
     if not isinstance(before, int | float) or not 0.0 <= before < 1.0:

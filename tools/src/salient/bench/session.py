@@ -219,13 +219,13 @@ class Session(KnownAttributes):
         """Ends a fault now. See Rig.clear_fault."""
         self.rig.clear_fault(kind, **places)
 
-    def scope(self, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25, divider: int = 1,
-              event: str = "control") -> Scope:
+    def scope(self, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25, divider: int = 1
+              ) -> Scope:
         """Arms the drive's triggered buffer for 1 to 8 signals at the control rate: scope = bench.scope(["current_a_A",
         "state"], trigger="state == fault"); its read() gives the arrays. See salient.bench.sampler.arm."""
         from salient.bench import sampler  # needs it in turn
 
-        return sampler.arm(self, signals, trigger, before=before, divider=divider, event=event)
+        return sampler.arm(self, signals, trigger, before=before, divider=divider)
 
     def run_for(self, duration_s: float) -> None:
         """Lets virtual time pass; commands go out as they fall due.

@@ -36,7 +36,7 @@ _REFERENCES = {"DRIVE_COMMAND": ("speed", "speed_reference_rpm"),
                "DRIVE_TORQUE_COMMAND": ("torque", "torque_reference_Nm")}
 _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
-_XCP_SET_MTA, _XCP_DOWNLOAD = 0xF6, 0xF0
+_XCP_SET_MTA, _XCP_DOWNLOAD, _XCP_DOWNLOAD_BYTES = 0xF6, 0xF0, 6
 _XCP_PARAMETERS = 0x10000000
 """Commands of XCP, and the address of the first parameter (firmware/comms/xcp.h)."""
 _SILENT_PERIODS = 3
@@ -152,10 +152,13 @@ class _Reader:
                       "PARAMETER_REQUEST": self._parameter_request, "DRIVE_ARMING": self._arming_report,
                       "PARAMETER_RESPONSE": self._parameter_response, "RIG_SET": self._rig_set,
                       "RIG_LOAD_PROFILE": self._load_profile, "RIG_FAULT": self._rig_fault,
-                      "XCP_COMMAND": self._xcp, "RIG_SET_REPLY": self._reply, "RIG_FAULT_REPLY": self._reply}
+                      "RIG_SET_REPLY": self._reply, "RIG_FAULT_REPLY": self._reply}
 
     def take(self, time_ns: int, message: Message, frame: can.Message) -> None:
         """Takes a frame of one of `messages`."""
+        if message.name == "XCP_COMMAND":  # of any length
+            self._xcp(time_ns, bytes(frame.data))
+            return
         from_host = _HOST in message.senders
         is_whole = len(frame.data) == message.length and not (frame.is_remote_frame or frame.is_fd)
         is_protected = from_host and any(signal.name == "checksum" for signal in message.signals)
@@ -281,13 +284,11 @@ class _Reader:
         if stimulus is not None and str(values["status"]) != "done":
             stimulus.text += f" (refused: {values['status']})"
 
-    def _xcp(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:
+    def _xcp(self, time_ns: int, data: bytes) -> None:
         """A write of a parameter; the rest of XCP reads and records."""
-        del message, values
-        data = bytes(frame.data)
-        if data[0] == _XCP_SET_MTA:
+        if data[:1] == bytes([_XCP_SET_MTA]):
             self._xcp_address = int.from_bytes(data[4:8], "little")
-        elif data[0] == _XCP_DOWNLOAD:
+        elif data[:1] == bytes([_XCP_DOWNLOAD]) and len(data) >= _XCP_DOWNLOAD_BYTES:
             index, rest = divmod(self._xcp_address - _XCP_PARAMETERS, 4)
             self._xcp_address += data[1]
             if rest == 0 and 0 <= index < len(self._rows):
