@@ -42,6 +42,16 @@ class Client(Protocol):
         """Lets virtual time pass until a frame meets the condition; TimeoutError after timeout_s."""
 
 
+class LoggingClient(Client, Protocol):
+    """A client that keeps what it has received, as Session does."""
+
+    log: list[tuple[int, can.Message]]
+    machine: str | None
+
+    def run_for(self, duration_s: float) -> None:
+        """Lets virtual time pass."""
+
+
 def unknown_attribute(name: str, known: Iterable[str]) -> AttributeError:
     """The error for an attribute that does not exist; its text names the nearest."""
     return AttributeError(f"no attribute '{name}'; {close_names(name, sorted(known))}")

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from salient.bench.client import LoggingClient
 from salient.bench.variables import Quantity, Variables
 from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
 from salient.config import either
@@ -26,8 +27,6 @@ from salient.errors import RunFailed, UsageError, close_names, shown
 
 if TYPE_CHECKING:
     from pyxcp.master.master import Master
-
-    from salient.bench.session import Session
 
 CHANNELS_MAX = 8
 DIVIDER_MAX = 65_535
@@ -130,7 +129,7 @@ class Recording:
 class Scope:
     """An armed buffer of a session's drive."""
 
-    def __init__(self, session: Session, quantities: Sequence[Quantity], before: int, period_s: float,
+    def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], before: int, period_s: float,
                  divider: int) -> None:
         self._session = session
         self._quantities = list(quantities)
@@ -167,11 +166,11 @@ class Scope:
                          {each.name: each.variable.names for each in self._quantities if each.variable.names})
 
 
-def arm(session: Session, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
+def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = None, *, before: float = 0.25,
         divider: int = 1) -> Scope:
-    """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th control period, from the part
-    `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on. UsageError: one of
-    these is wrong; ScopeError: the drive's memory has another layout than the program here."""
+    """Arms the buffer: 1 to CHANNELS_MAX signals (salient.bench.variables), at every `divider`-th control period, from
+    the part `before` of the buffer in front of the trigger on (parse_trigger; None: at once), or from now on.
+    UsageError: one of these is wrong; ScopeError: the drive's memory has another layout than the program here."""
     variables = variables_of(session)
     if isinstance(signals, str) or not 1 <= len(signals) <= CHANNELS_MAX:
         raise UsageError(f"signals: must be 1 to {CHANNELS_MAX} names")
@@ -209,7 +208,7 @@ def _variables(build: str, machine: str | None) -> Variables:
     return Variables(build, machine)
 
 
-def variables_of(session: Session) -> Variables:
+def variables_of(session: LoggingClient) -> Variables:
     """The variables of a session's drive, in the memory of its build; of a drive that runs by itself, of the host's."""
     options = getattr(session, "options", None)
     return _variables("host" if options is None else options.build, session.machine)
@@ -248,7 +247,7 @@ def _values(words: np.ndarray, quantity: Quantity) -> np.ndarray:
     return raw.astype(np.int64) if quantity.factor == 1.0 else raw * quantity.factor
 
 
-def _control_rate_hz(session: Session) -> float:
+def _control_rate_hz(session: LoggingClient) -> float:
     """By the drive's heartbeat, which comes every 100 ms."""
     deadline_ns = session.time_ns + 200_000_000
     while not session.telemetry.count("DRIVE_HEARTBEAT"):

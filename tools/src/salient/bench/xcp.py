@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from salient.bench.session import Session
+from salient.bench.client import LoggingClient
 from salient.bus.signals import drive_database
 from salient.errors import RunFailed
 
@@ -47,7 +47,7 @@ class SessionInterface:
     filters: list[dict[str, Any]] | None = None
     state = can.BusState.ACTIVE
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: LoggingClient) -> None:
         self._session = session
         self._command_id = session.drive_database.get_message_by_name("XCP_COMMAND").frame_id
         self._response_id = session.drive_database.get_message_by_name("XCP_RESPONSE").frame_id
@@ -99,7 +99,7 @@ def key_of(resource: int, seed: bytes) -> bytes:
 
 
 @contextmanager
-def connected(session: Session) -> Iterator[Master]:
+def connected(session: LoggingClient) -> Iterator[Master]:
     """A connected pyXCP master with both resources unlocked. XcpError: see SessionInterface; RunFailed without pyXCP.
     """
     try:
