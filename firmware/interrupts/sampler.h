@@ -3,8 +3,8 @@
  * At every `divider`-th event it copies up to eight words of the drive, each with the variables in it, into a ring. As
  * a buffer it compares one variable with a level at every event, whatever the divider; from the event at which the
  * condition holds it goes on until the ring is full of `before` records that precede it, or those that there are, and
- * those that follow. As a stream it records
- * until it is stopped; a record for which the background has left no room is lost and counted.
+ * those that follow. As a stream it records until it is stopped; a record for which the background has left no room is
+ * lost and counted.
  *
  * A word that another context writes is read whole; two words of one variable may be of two steps.
  */

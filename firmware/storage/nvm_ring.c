@@ -9,7 +9,7 @@
 
 /* 0 when the length has changed in memory to 0. */
 static unsigned slots(const nvm_ring_t *ring) {
-    return ring->record_words > 0 ? HAL_NVM_PAGE_WORDS / ring->record_words : 0;
+    return ring->record_words > 0 ? (unsigned)HAL_NVM_PAGE_WORDS / ring->record_words : 0u;
 }
 
 static uint64_t read_word(const nvm_ring_t *ring, const hal_t *hal, unsigned page, unsigned slot, unsigned word) {

@@ -82,7 +82,7 @@ def test_drive_of_a_map_performs_as_the_drive_of_its_formula(grid, of_formula, t
     assert 2.0 < np.mean(of_formula.dips_rpm) < 5.0
     assert of_map.settling_time_s == pytest.approx(of_formula.settling_time_s, rel=0.01)
     assert np.mean(of_map.dips_rpm) == pytest.approx(np.mean(of_formula.dips_rpm), rel=0.03)
-    assert of_map.dips_rpm == pytest.approx(of_formula.dips_rpm, abs=0.4)  # by the period in which it is noticed
+    assert of_map.dips_rpm == pytest.approx(of_formula.dips_rpm, abs=0.5)  # by the period in which it is noticed
     assert of_map.torques_Nm == pytest.approx(of_formula.torques_Nm, rel=1e-3)
     assert of_map.currents_A == pytest.approx(of_formula.currents_A, rel=2e-3)
     assert np.mean(of_map.ripples) == pytest.approx(np.mean(of_formula.ripples), rel=0.1)

@@ -171,7 +171,7 @@ def test_every_short_name_is_a_variable_with_the_unit_that_it_has():
 @pytest.mark.parametrize(("text", "level"), [
     ("current_a_A > 1", 513), ("current_a_A >= 1", 512), ("current_a_A < 1", 511), ("current_a_A <= 1", 512),
     ("current_a_A rises to 1", 512), ("current_a_A falls to 1", 512), ("state == run", 2),
-    ("state == DRIVE_STATE_RUN", 2),
+    ("state == DRIVE_STATE_RUN", 2), ("angle_deg >= 270", 3 << 30),
 ])
 def test_level_of_a_trigger_is_the_raw_value_that_the_comparison_means(text, level):
     assert parse_trigger(text, Variables(machine="saturating")).level == level

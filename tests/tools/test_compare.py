@@ -832,7 +832,7 @@ def test_groups_are_listed():
     assert [line.split()[0] for line in output.splitlines()] == list(GROUPS)
     assert [line.split()[0] for line in output.splitlines() if "only when named" in line] == [
         "every_speed", "torque_speed_random", "partial_torque", "copper_random", "transition", "torque_conditions",
-        "encoders", "misalignment", "standing_error", "hold", "robustness", "machines"]
+        "encoders", "misalignment", "standing_error", "hold", "mismatch", "robustness", "machines"]
 
 
 def test_unknown_group_is_reported():

@@ -37,9 +37,10 @@ class XcpFuzz : public XcpBench {
         const uint32_t of_address = (xcp.address & ~XCP_AREA) / 4;
         if ((xcp.address & XCP_AREA) == XCP_AREA_PARAMETERS && of_address < PARAMETER_COUNT && !rarely(4)) {
             const parameter_row_t *row = parameters_row(of_address);
-            const int32_t present = drive->parameters.values[of_address];
-            const int32_t values[] = {present, present, row->minimum, row->maximum, present + 1, present - 1};
-            return uint32_t(values[any(6)]);
+            const auto present = uint32_t(drive->parameters.values[of_address]);
+            const uint32_t values[] = {present,      present,     uint32_t(row->minimum), uint32_t(row->maximum),
+                                       present + 1u, present - 1u};
+            return values[any(6)];
         }
         const uint32_t values[] = {any(4), any(10), 4 * any(DRIVE_WORDS), any(70000), uint32_t(random())};
         return values[any(5)];

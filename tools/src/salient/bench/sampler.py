@@ -39,7 +39,7 @@ _WORDS = ("command", "event", "divider", "before", "condition", "level", "variab
 """Words in the area of XCP, as xcp_scope_word_t; the last is the first of CHANNELS_MAX."""
 _AT_ONCE, _AT_LEAST, _AT_MOST, _RISING, _FALLING, _EQUAL, _CHANGED = range(7)
 """sampler_condition_t."""
-_WORD_BYTES, _LEVEL_MAX, _WORD_BITS = 4, 2**31 - 1, 32
+_WORD_BYTES, _WORD_BITS = 4, 32
 _POLL_S = 2e-3
 _EXPRESSION = re.compile(r"\s*(?P<name>[\w.\[\]]+)\s*(?P<operator>>=|<=|==|>|<|rises to|falls to|changes)"
                          r"\s*(?P<value>[\w.+-]*)\s*")
@@ -77,9 +77,9 @@ def parse_trigger(text: str, variables: Variables) -> Trigger:
     }[found["operator"]]
     bits = 8 * quantity.variable.bytes
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if quantity.variable.is_signed else (0, (1 << bits) - 1)
-    if not least <= rounded <= min(most, _LEVEL_MAX):
+    if not least <= rounded <= most:
         raise UsageError(f"trigger '{text}': {quantity.name} is from {least * quantity.factor:g} to "
-                         f"{min(most, _LEVEL_MAX) * quantity.factor:g} {quantity.unit}".rstrip())
+                         f"{most * quantity.factor:g} {quantity.unit}".rstrip())
     return Trigger(quantity, condition, rounded)
 
 
