@@ -27,7 +27,7 @@
 
 /* Loads and stores before it are not moved behind it, nor those behind it before it: for what the background and an
  * interrupt of the same processor share. No instruction. */
-#define IN_ORDER() __atomic_signal_fence(__ATOMIC_SEQ_CST)
+#define MEMORY_ORDER() __atomic_signal_fence(__ATOMIC_SEQ_CST)
 
 /* A condition that holds in the longest interrupt: its code follows it without a jump. 4 of the computed bound of
  * traditional. */

@@ -107,7 +107,7 @@ NOINLINE void sampler_record(sampler_t *sampler, const void *memory, uint32_t wo
 
 COLD void sampler_stop(sampler_t *sampler) {
     *(volatile uint32_t *)&sampler->event = 0;
-    IN_ORDER(); /* the interrupt leaves the rest alone from here on */
+    MEMORY_ORDER(); /* the interrupt leaves the rest alone from here on */
     if (sampler->state != SAMPLER_COMPLETE) {
         sampler->state = SAMPLER_OFF;
     }
@@ -142,7 +142,7 @@ COLD bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool str
     sampler->countdown = 1;
     sampler->has_last = false;
     sampler->state = streams ? SAMPLER_STREAMS : SAMPLER_WAITS;
-    IN_ORDER(); /* the interrupt of the event may come from here on */
+    MEMORY_ORDER(); /* the interrupt of the event may come from here on */
     *(volatile uint32_t *)&sampler->event = setup->event;
     return true;
 }
@@ -155,14 +155,14 @@ COLD bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_
     if (sampler->state != SAMPLER_STREAMS || *(volatile uint32_t *)&sampler->written == sampler->taken) {
         return false;
     }
-    IN_ORDER();
+    MEMORY_ORDER();
     uint32_t place = sampler->taken_place;
     for (uint32_t i = 0; i < sampler->record_words && i <= SAMPLER_CHANNELS_MAX; i++) {
         record[i] = place < SAMPLER_WORDS ? sampler->ring[place] : 0;
         place++;
     }
     sampler->taken_place = next_place(sampler, place);
-    IN_ORDER(); /* the interrupt may overwrite the record from here on */
+    MEMORY_ORDER(); /* the interrupt may overwrite the record from here on */
     *(volatile uint32_t *)&sampler->taken = sampler->taken + 1u;
     return true;
 }
