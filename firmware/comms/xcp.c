@@ -1,6 +1,7 @@
 #include "comms/xcp.h"
 
 #include "comms/arming.h"
+#include "comms/xcp_code.h"
 #include "comms/xcp_daq.h"
 #include "comms/xcp_memory.h"
 #include "control/machine_tables.h"
@@ -8,22 +9,6 @@
 #include "fixed/fixed.h"
 #include "hal_random.h"
 #include "layout_hash.h"
-
-enum {
-    DOWNLOAD = 0xF0,
-    SHORT_UPLOAD = 0xF4,
-    UPLOAD = 0xF5,
-    SET_MTA = 0xF6,
-    UNLOCK = 0xF7,
-    GET_SEED = 0xF8,
-    SET_REQUEST = 0xF9,
-    GET_ID = 0xFA,
-    GET_COMM_MODE_INFO = 0xFB,
-    SYNCH = 0xFC,
-    GET_STATUS = 0xFD,
-    DISCONNECT = 0xFE,
-    CONNECT = 0xFF,
-};
 
 enum { RESPONSE = 0xFF, ERROR = 0xFE };
 enum { ID_TEXT = 0, ID_FILE_NAME = 1, ID_EPK = 5 };
@@ -41,17 +26,34 @@ typedef struct {
     uint8_t length;
 } message_t;
 
-/* Bytes of a command without data and keys of a count of its own; 0: one byte, or a command of xcp_daq.h. */
-#define COMMAND_INDEX 0x0F /* of a code from DOWNLOAD on */
+/* Bytes of a command without data and keys of a count of its own; 0: one. Codes are unique in their lower six bits. */
+#define COMMAND_INDEX 0x3F
 static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
-    [DOWNLOAD & COMMAND_INDEX] = 2,    [SHORT_UPLOAD & COMMAND_INDEX] = 8, [UPLOAD & COMMAND_INDEX] = 2,
-    [SET_MTA & COMMAND_INDEX] = 8,     [UNLOCK & COMMAND_INDEX] = 2,       [GET_SEED & COMMAND_INDEX] = 3,
-    [SET_REQUEST & COMMAND_INDEX] = 4, [GET_ID & COMMAND_INDEX] = 2,       [CONNECT & COMMAND_INDEX] = 2,
+    [ALLOC_ODT_ENTRY & COMMAND_INDEX] = 6,
+    [ALLOC_ODT & COMMAND_INDEX] = 5,
+    [ALLOC_DAQ & COMMAND_INDEX] = 4,
+    [GET_DAQ_EVENT_INFO & COMMAND_INDEX] = 4,
+    [GET_DAQ_LIST_INFO & COMMAND_INDEX] = 4,
+    [START_STOP_SYNCH & COMMAND_INDEX] = 2,
+    [START_STOP_DAQ_LIST & COMMAND_INDEX] = 4,
+    [GET_DAQ_LIST_MODE & COMMAND_INDEX] = 4,
+    [SET_DAQ_LIST_MODE & COMMAND_INDEX] = 7,
+    [WRITE_DAQ & COMMAND_INDEX] = 8,
+    [SET_DAQ_PTR & COMMAND_INDEX] = 6,
+    [DOWNLOAD & COMMAND_INDEX] = 2,
+    [SHORT_UPLOAD & COMMAND_INDEX] = 8,
+    [UPLOAD & COMMAND_INDEX] = 2,
+    [SET_MTA & COMMAND_INDEX] = 8,
+    [UNLOCK & COMMAND_INDEX] = 2,
+    [GET_SEED & COMMAND_INDEX] = 3,
+    [SET_REQUEST & COMMAND_INDEX] = 4,
+    [GET_ID & COMMAND_INDEX] = 2,
+    [CONNECT & COMMAND_INDEX] = 2,
 };
 
 static bool is_whole(const uint8_t *command, unsigned bytes) {
     const bool counted = command[0] == DOWNLOAD || command[0] == UNLOCK;
-    const unsigned least = command[0] < DOWNLOAD ? 0 : least_bytes[command[0] & COMMAND_INDEX];
+    const unsigned least = command[0] < ALLOC_ODT_ENTRY ? 0 : least_bytes[command[0] & COMMAND_INDEX];
     return bytes >= least + (counted ? fixed_min_u32(command[1], DOWNLOAD_BYTES) : 0);
 }
 
@@ -96,16 +98,6 @@ static void end_session(xcp_t *xcp) {
     xcp->upload_left = 0;
 }
 
-static void put_word(uint8_t *at, uint32_t value) {
-    for (unsigned i = 0; i < 4; i++) {
-        at[i] = (uint8_t)(value >> (8 * i));
-    }
-}
-
-static uint32_t word_of(const uint8_t *at) {
-    return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
-}
-
 static void respond(message_t *response, const uint8_t *bytes, uint8_t count) {
     for (unsigned i = 0; i < count; i++) {
         response->data[1 + i] = bytes[i];
@@ -148,7 +140,7 @@ static xcp_error_t get_seed(xcp_t *xcp, hal_t *hal, const uint8_t *command, uint
         xcp->seed_us = time_us;
         xcp->seed_resource = command[2];
         bytes[0] = KEY_BYTES;
-        put_word(bytes + 1, xcp->seed);
+        xcp_put_word(bytes + 1, xcp->seed);
     }
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;
@@ -160,7 +152,8 @@ static xcp_error_t unlock(xcp_t *xcp, const uint8_t *command, uint32_t time_us, 
     if (seed == 0) {
         return XCP_ERROR_SEQUENCE;
     }
-    if (command[1] != KEY_BYTES || word_of(command + 2) != ~seed || time_us - xcp->seed_us > ARMING_RESPONSE_MAX_US) {
+    if (command[1] != KEY_BYTES || xcp_get_word(command + 2) != ~seed ||
+        time_us - xcp->seed_us > ARMING_RESPONSE_MAX_US) {
         end_session(xcp); /* as the standard asks */
         return XCP_ERROR_ACCESS_LOCKED;
     }
@@ -214,7 +207,7 @@ static xcp_error_t set_address(xcp_t *xcp, const uint8_t *command) {
     if (command[3] != 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
-    xcp->address = word_of(command + 4);
+    xcp->address = xcp_get_word(command + 4);
     return XCP_ERROR_NONE;
 }
 
@@ -223,7 +216,7 @@ static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, cons
     if (command[1] > DATA_BYTES || command[3] != 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
-    xcp->address = word_of(command + 4);
+    xcp->address = xcp_get_word(command + 4);
     return upload(xcp, parameters, command[1], response);
 }
 
@@ -263,7 +256,7 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsig
     case DOWNLOAD:
         return download(xcp, context, command);
     default:
-        return xcp_daq_command(xcp, command, bytes, response->data, &response->length);
+        return xcp_daq_command(xcp, command, response->data, &response->length);
     }
 }
 

@@ -1,26 +1,6 @@
 #include "comms/xcp_daq.h"
 
-#include "fixed/compiler.h"
-#include "fixed/fixed.h"
-
-enum {
-    ALLOC_ODT_ENTRY = 0xD3,
-    ALLOC_ODT = 0xD4,
-    ALLOC_DAQ = 0xD5,
-    FREE_DAQ = 0xD6,
-    GET_DAQ_EVENT_INFO = 0xD7,
-    GET_DAQ_RESOLUTION_INFO = 0xD9,
-    GET_DAQ_PROCESSOR_INFO = 0xDA,
-    GET_DAQ_LIST_INFO = 0xD8,
-    GET_DAQ_CLOCK = 0xDC,
-    START_STOP_SYNCH = 0xDD,
-    START_STOP_DAQ_LIST = 0xDE,
-    GET_DAQ_LIST_MODE = 0xDF,
-    SET_DAQ_LIST_MODE = 0xE0,
-    WRITE_DAQ = 0xE1,
-    SET_DAQ_PTR = 0xE2,
-    CLEAR_DAQ_LIST = 0xE3,
-};
+#include "comms/xcp_code.h"
 
 enum { WORD_BYTES = 4, MODE_TIMESTAMP = 0x10, MODE_SELECTED = 0x01, MODE_RUNNING = 0x40 };
 enum { STOP, START, SELECT };                     /* of a list */
@@ -32,30 +12,6 @@ enum { FIRST_BYTES = 7, TIMESTAMP_BYTES = 2 };
 /* Size 2, unit 1 us, one tick is one unit. */
 #define TIMESTAMP_MODE (TIMESTAMP_BYTES | 3u << 4)
 #define EVENT_PROPERTIES 0x04u /* of DAQ */
-
-/* Bytes of a command, whose code is unique in its lower five bits; 0: one. */
-#define COMMAND_INDEX 0x1F
-static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
-    [ALLOC_ODT_ENTRY & COMMAND_INDEX] = 6,     [ALLOC_ODT & COMMAND_INDEX] = 5,
-    [ALLOC_DAQ & COMMAND_INDEX] = 4,           [GET_DAQ_EVENT_INFO & COMMAND_INDEX] = 4,
-    [GET_DAQ_LIST_INFO & COMMAND_INDEX] = 4,   [START_STOP_SYNCH & COMMAND_INDEX] = 2,
-    [START_STOP_DAQ_LIST & COMMAND_INDEX] = 4, [GET_DAQ_LIST_MODE & COMMAND_INDEX] = 4,
-    [SET_DAQ_LIST_MODE & COMMAND_INDEX] = 7,   [WRITE_DAQ & COMMAND_INDEX] = 8,
-    [SET_DAQ_PTR & COMMAND_INDEX] = 6,
-};
-
-static uint16_t half_word(const uint8_t *at) {
-    return (uint16_t)(at[0] | at[1] << 8);
-}
-
-static uint32_t whole_word(const uint8_t *at) {
-    return half_word(at) | (uint32_t)half_word(at + 2) << 16;
-}
-
-static void put_half_word(uint8_t *at, uint32_t value) {
-    at[0] = (uint8_t)value;
-    at[1] = (uint8_t)(value >> 8);
-}
 
 void xcp_daq_stop(xcp_t *xcp) {
     if (xcp->daq.running) {
@@ -112,7 +68,8 @@ static xcp_error_t allocate_entries(xcp_daq_t *daq, unsigned list, uint8_t odt, 
 
 static xcp_error_t set_pointer(xcp_daq_t *daq, const uint8_t *command) {
     const unsigned odt = command[4];
-    if (half_word(command + 2) != 0 || odt >= daq->odts || daq->odt[odt].begin + command[5] >= daq->odt[odt].end) {
+    if (xcp_get_half_word(command + 2) != 0 || odt >= daq->odts ||
+        daq->odt[odt].begin + command[5] >= daq->odt[odt].end) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
     daq->pointer = (uint8_t)(daq->odt[odt].begin + command[5]);
@@ -123,7 +80,7 @@ static xcp_error_t set_pointer(xcp_daq_t *daq, const uint8_t *command) {
 /* No bit is masked. An entry lies within a word, which is recorded whole. */
 static xcp_error_t write_entry(xcp_t *xcp, const uint8_t *command) {
     xcp_daq_t *daq = &xcp->daq;
-    const uint32_t address = whole_word(command + 4);
+    const uint32_t address = xcp_get_word(command + 4);
     const unsigned bytes = command[2], first = address % WORD_BYTES;
     if (daq->pointer >= daq->pointer_end) {
         return XCP_ERROR_SEQUENCE;
@@ -137,8 +94,8 @@ static xcp_error_t write_entry(xcp_t *xcp, const uint8_t *command) {
 }
 
 static xcp_error_t set_mode(xcp_daq_t *daq, const uint8_t *command) {
-    if (daq->allocated == XCP_DAQ_FREE || half_word(command + 2) != 0 || half_word(command + 4) >= XCP_EVENTS ||
-        command[6] == 0) {
+    if (daq->allocated == XCP_DAQ_FREE || xcp_get_half_word(command + 2) != 0 ||
+        xcp_get_half_word(command + 4) >= XCP_EVENTS || command[6] == 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
     if ((command[1] & ~MODE_TIMESTAMP) != 0) {
@@ -189,7 +146,7 @@ static xcp_error_t start(xcp_t *xcp) {
 static xcp_error_t start_or_stop(xcp_t *xcp, const uint8_t *command, uint8_t *response, uint8_t *length) {
     xcp_daq_t *daq = &xcp->daq;
     if (command[0] == START_STOP_DAQ_LIST) {
-        if (half_word(command + 2) != 0 || daq->allocated != XCP_DAQ_ENTRIES) {
+        if (xcp_get_half_word(command + 2) != 0 || daq->allocated != XCP_DAQ_ENTRIES) {
             return XCP_ERROR_OUT_OF_RANGE;
         }
         if (command[1] > SELECT) {
@@ -223,18 +180,18 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
     switch (command[0]) {
     case GET_DAQ_PROCESSOR_INFO:
         response[1] = DAQ_PROPERTIES;
-        put_half_word(response + 2, 1); /* lists */
-        put_half_word(response + 4, XCP_EVENTS);
+        xcp_put_half_word(response + 2, 1); /* lists */
+        xcp_put_half_word(response + 4, XCP_EVENTS);
         return XCP_ERROR_NONE;
     case GET_DAQ_RESOLUTION_INFO:
         response[1] = 1; /* granularity and largest size of an entry, bytes */
         response[2] = WORD_BYTES;
         response[3] = 1; /* the same of stimulation, which there is not */
         response[5] = TIMESTAMP_MODE;
-        put_half_word(response + 6, 1);
+        xcp_put_half_word(response + 6, 1);
         return XCP_ERROR_NONE;
     case GET_DAQ_EVENT_INFO:
-        if (half_word(command + 2) >= XCP_EVENTS) {
+        if (xcp_get_half_word(command + 2) >= XCP_EVENTS) {
             return XCP_ERROR_OUT_OF_RANGE;
         }
         response[1] = EVENT_PROPERTIES;
@@ -244,7 +201,7 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
         *length = 7;
         return XCP_ERROR_NONE;
     case GET_DAQ_LIST_INFO:
-        if (half_word(command + 2) != 0) {
+        if (xcp_get_half_word(command + 2) != 0) {
             return XCP_ERROR_OUT_OF_RANGE;
         }
         response[1] = 0x04; /* DAQ, event and set-up not fixed */
@@ -253,18 +210,17 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
         *length = 6;
         return XCP_ERROR_NONE;
     case GET_DAQ_LIST_MODE:
-        if (half_word(command + 2) != 0) {
+        if (xcp_get_half_word(command + 2) != 0) {
             return XCP_ERROR_OUT_OF_RANGE;
         }
         response[1] = (uint8_t)((daq->selected ? MODE_SELECTED : 0) | (daq->timestamps ? MODE_TIMESTAMP : 0) |
                                 (daq->running ? MODE_RUNNING : 0));
-        put_half_word(response + 4, daq->event);
+        xcp_put_half_word(response + 4, daq->event);
         response[6] = daq->divider;
         return XCP_ERROR_NONE;
     case GET_DAQ_CLOCK:
     default: /* the time at which the command was received */
-        put_half_word(response + 4, xcp->received_us);
-        put_half_word(response + 6, xcp->received_us >> 16);
+        xcp_put_word(response + 4, xcp->received_us);
         return XCP_ERROR_NONE;
     }
 }
@@ -285,11 +241,11 @@ static xcp_error_t set_up(xcp_t *xcp, const uint8_t *command) {
         *daq = (xcp_daq_t){0};
         return XCP_ERROR_NONE;
     case ALLOC_DAQ:
-        return allocate_list(daq, half_word(command + 2));
+        return allocate_list(daq, xcp_get_half_word(command + 2));
     case ALLOC_ODT:
-        return allocate_odts(daq, half_word(command + 2), command[4]);
+        return allocate_odts(daq, xcp_get_half_word(command + 2), command[4]);
     case ALLOC_ODT_ENTRY:
-        return allocate_entries(daq, half_word(command + 2), command[4], command[5]);
+        return allocate_entries(daq, xcp_get_half_word(command + 2), command[4], command[5]);
     default:
         return XCP_ERROR_UNKNOWN;
     }
@@ -300,13 +256,10 @@ static bool only_describes(uint8_t code) {
            code == GET_DAQ_LIST_INFO || code == GET_DAQ_LIST_MODE || code == GET_DAQ_CLOCK;
 }
 
-xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, uint8_t *response, uint8_t *length) {
+xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, uint8_t *response, uint8_t *length) {
     const uint8_t code = command[0];
     if (code < ALLOC_ODT_ENTRY || code > CLEAR_DAQ_LIST) {
         return XCP_ERROR_UNKNOWN;
-    }
-    if (bytes < least_bytes[code & COMMAND_INDEX]) {
-        return XCP_ERROR_SYNTAX;
     }
     if (only_describes(code)) {
         return describe(xcp, command, response, length);
@@ -336,7 +289,7 @@ bool xcp_daq_next_frame(xcp_t *xcp, hal_can_frame_t *frame) {
     frame->data[0] = (uint8_t)number;
     frame->length = 1;
     if (number == 0 && daq->timestamps) {
-        put_half_word(frame->data + 1, daq->record[0]);
+        xcp_put_half_word(frame->data + 1, daq->record[0]);
         frame->length = 1 + TIMESTAMP_BYTES;
     }
     for (unsigned entry = odt->begin; entry < odt->end && entry < SAMPLER_CHANNELS_MAX; entry++) {

@@ -5,10 +5,10 @@
 #include "comms/xcp.h"
 #include "comms/xcp_memory.h"
 
-/* Executes a command of the group DAQ, of 8 bytes with zeros behind the `bytes` that have come. response: 8 bytes, the
+/* Executes a command of the group DAQ, whole, of 8 bytes with zeros behind those that have come. response: 8 bytes, the
  * first one written by the caller; length of it is written as well. XCP_ERROR_UNKNOWN: a command of another group.
  * [background] */
-xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, unsigned bytes, uint8_t *response, uint8_t *length);
+xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, uint8_t *response, uint8_t *length);
 
 /* Stops measuring. [background] */
 void xcp_daq_stop(xcp_t *xcp);

@@ -1,14 +1,12 @@
 #include "comms/xcp_memory.h"
 
-#include "fixed/compiler.h"
+#include "comms/xcp_code.h"
 
 #define WORD_BYTES 4u
 
 typedef enum { SCOPE_STOP, SCOPE_ARM, SCOPE_TRIGGER, SCOPE_COMMANDS } scope_command_t;
 
 static const char event_names[XCP_EVENTS][XCP_TEXT_BYTES] = {"control", "background"};
-
-typedef const volatile uint32_t MAY_ALIAS memory_word_t;
 
 static bool within(uint32_t offset, unsigned bytes, uint32_t area_bytes) {
     return offset < area_bytes && bytes <= area_bytes - offset;
@@ -20,7 +18,7 @@ static uint8_t byte_of(uint32_t word, uint32_t offset) {
 
 /* Words are read whole, so that a variable within one is of one step; a word twice when two variables share it. */
 static void read_memory(const xcp_t *xcp, uint32_t offset, unsigned bytes, uint8_t *to) {
-    memory_word_t *words = xcp->memory;
+    sampler_word_t *words = xcp->memory;
     uint32_t word = words[offset / WORD_BYTES];
     for (unsigned i = 0; i < bytes; i++, offset++) {
         if (i > 0 && offset % WORD_BYTES == 0) {
@@ -180,7 +178,7 @@ xcp_error_t xcp_memory_write(xcp_t *xcp, const xcp_context_t *context, uint32_t 
     if (bytes != WORD_BYTES || offset % WORD_BYTES != 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
-    const uint32_t value = from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 | (uint32_t)from[3] << 24;
+    const uint32_t value = xcp_get_word(from);
     return area == XCP_AREA_SCOPE ? write_scope(xcp, offset / WORD_BYTES, value)
                                   : write_parameter(xcp, context, offset / WORD_BYTES, value);
 }

@@ -5,12 +5,9 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* The drive as words, whatever they belong to. */
-typedef const volatile uint32_t MAY_ALIAS memory_word_t;
-
 /* A place out of the drive, as after a change in memory, reads 0. */
 static inline uint32_t word_at(const void *memory, uint32_t words, uint32_t word) {
-    return word < words ? ((memory_word_t *)memory)[word] : 0;
+    return word < words ? ((sampler_word_t *)memory)[word] : 0;
 }
 
 /* Unsigned values are compared as signed ones from -2^31 on, in their order. */

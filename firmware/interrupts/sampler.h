@@ -14,7 +14,12 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "fixed/compiler.h"
+
 #define SAMPLER_CHANNELS_MAX 8u
+
+/* The drive as words, whatever they belong to, each of which an interrupt may write meanwhile. */
+typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
 
 /* Size of the ring, words; 0 for a processor that has no memory for it: then nothing can be armed. */
 #ifndef SAMPLER_WORDS
