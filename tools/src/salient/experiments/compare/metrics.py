@@ -23,6 +23,7 @@ from salient.machine.file import load_machine, machine_path
 
 Metrics = dict[str, float | None]
 Window = tuple[float, float]
+Extractor = Callable[..., Metrics]
 PAPER_WINDOW_S = metrics.RIPPLE_WINDOW_S
 
 STEADY_S = 0.5
@@ -193,40 +194,6 @@ def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
     return {"speed_swing_rpm": swing_rpm, **({"swing_of_free": swing_rpm / free_rpm} if free_rpm else {})}
 
 
-def held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """A run of speed_range.py; so are the next four."""
-    return speed_range.held_metrics(scenario, recording)
-
-
-def held_part_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return speed_range.held_part_metrics(scenario, recording)
-
-
-def held_copper_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return speed_range.held_copper_metrics(scenario, recording)
-
-
-def fast_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return speed_range.fast_step_metrics(scenario, recording)
-
-
-def speed_ramps_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return speed_range.speed_ramps_metrics(scenario, recording)
-
-
-def mismatch_step_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """A run of mismatch.py; so are the next two."""
-    return mismatch.step_metrics(scenario, recording)
-
-
-def mismatch_held_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return mismatch.held_metrics(scenario, recording)
-
-
-def mismatch_fast_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    return mismatch.fast_metrics(scenario, recording)
-
-
 def step_and_ripple_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """A load step, and ripple and mean torque over the window."""
     torque = metrics.torque_metrics(recording["time_s"], recording["torque_Nm"], window_s)
@@ -340,25 +307,25 @@ def robustness_metrics(scenario: Scenario, recording: np.ndarray, window_s: Wind
     }
 
 
-def every_machine_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
-    """A run of every_machine.py."""
-    return every_machine.extract(scenario, recording)
+def _of_run(extract: Callable[[Scenario, np.ndarray], Metrics]) -> Extractor:
+    """An extractor that looks at the whole recording, whatever the window."""
+    return lambda scenario, recording, _=PAPER_WINDOW_S: extract(scenario, recording)
 
 
-EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
+EXTRACTORS: dict[str, Extractor] = {
     "ripple": ripple_metrics,
     "start": start_metrics,
     "load_step": load_step_metrics,
     "counts": counts_metrics,
     "moving": moving_metrics,
-    "held": held_metrics,
-    "held_part": held_part_metrics,
-    "held_copper": held_copper_metrics,
-    "fast_step": fast_step_metrics,
-    "speed_ramps": speed_ramps_metrics,
-    "mismatch_step": mismatch_step_metrics,
-    "mismatch_held": mismatch_held_metrics,
-    "mismatch_fast": mismatch_fast_metrics,
+    "held": _of_run(speed_range.held_metrics),
+    "held_part": _of_run(speed_range.held_part_metrics),
+    "held_copper": _of_run(speed_range.held_copper_metrics),
+    "fast_step": _of_run(speed_range.fast_step_metrics),
+    "speed_ramps": _of_run(speed_range.speed_ramps_metrics),
+    "mismatch_step": _of_run(mismatch.step_metrics),
+    "mismatch_held": _of_run(mismatch.held_metrics),
+    "mismatch_fast": _of_run(mismatch.fast_metrics),
     "step_and_ripple": step_and_ripple_metrics,
     "encoder": encoder_metrics,
     "encoder_course": encoder_course_metrics,
@@ -368,7 +335,7 @@ EXTRACTORS: dict[str, Callable[[Scenario, np.ndarray, Window], Metrics]] = {
     "mean_error": mean_error_metrics,
     "hold": hold_metrics,
     "robustness": robustness_metrics,
-    "every_machine": every_machine_metrics,
+    "every_machine": _of_run(every_machine.extract),
     "random_load": random_load_metrics,
 }
 
