@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from salient.bench.client import LoggingClient
-from salient.bench.variables import Quantity, Variables
+from salient.bench.variables import Quantity, Variables, short_names
 from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
 from salient.config import either
 from salient.errors import RunFailed, UsageError, close_names, shown
@@ -84,27 +84,19 @@ def parse_trigger(text: str, variables: Variables) -> Trigger:
 
 
 def _raw(text: str, quantity: Quantity, expression: str) -> float:
-    names = {name: value for value, name in quantity.variable.names.items()}
-    short = {re.sub(f"^{re.escape(_common_prefix(names))}", "", name).lower(): value for name, value in names.items()}
-    if text in names or text in short:
-        return names.get(text, short.get(text, 0))
+    names = quantity.variable.names
+    short = short_names(names)
+    for of in (names, short):
+        if text in of.values():
+            return next(value for value, name in of.items() if name == text)
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        reason = f"must be a number or {either(list(short))}" if names else "must be a number"
+        reason = f"must be a number or {either(list(short.values()))}" if names else "must be a number"
         raise UsageError(f"trigger '{expression}': {text} {reason}")
     return value / quantity.factor
-
-
-def _common_prefix(names: Mapping[str, int]) -> str:
-    """Words that the names of an enumeration have in common: "DRIVE_STATE_"."""
-    words = [name.split("_") for name in names]
-    count = 0
-    while words and all(len(each) > count + 1 and each[count] == words[0][count] for each in words):
-        count += 1
-    return "".join(f"{word}_" for word in words[0][:count]) if words else ""
 
 
 @dataclass(frozen=True)

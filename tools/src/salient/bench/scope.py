@@ -20,7 +20,7 @@ from salient.bench.drive import FaultTrace
 from salient.bench.failure import COLOURS
 from salient.bench.session import SILENCE_MAX_S, Session
 from salient.bench.variables import SIGNALS as SHORT_NAMES
-from salient.bench.variables import Variables
+from salient.bench.variables import Variables, short_names
 from salient.bus.databases import load_databases, messages_of
 from salient.bus.frame_bits import BitRates
 from salient.bus.log import open_log
@@ -97,8 +97,8 @@ def plot_recording(recording: sampler.Recording, path: Path, title: str) -> None
         axis.axvline(0.0, color="grey", linewidth=0.8)
         _label(axis, name if name in SHORT_NAMES else f"{name}, {recording.units[name]}".rstrip(", "))
         if name in recording.names:
-            axis.set_yticks(list(recording.names[name]), [text.rsplit("_", 1)[-1].lower() for text in
-                                                          recording.names[name].values()])
+            labels = short_names(recording.names[name])
+            axis.set_yticks(list(labels), list(labels.values()))
     axes[-1].set_xlabel("time from the trigger, ms")
     figure.suptitle(title)
     figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -17,6 +17,7 @@ from cantools.database.errors import DecodeError
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 from salient.bench.arming import response_to
+from salient.bench.xcp import AREA_PARAMETERS
 from salient.bus import e2e
 from salient.bus.signals import FrameKey, drive_database, frame_key, rig_database
 from salient.machine.file import load_machine, machine_path
@@ -37,8 +38,7 @@ _REFERENCES = {"DRIVE_COMMAND": ("speed", "speed_reference_rpm"),
 _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
 _XCP_SET_MTA, _XCP_DOWNLOAD, _XCP_DOWNLOAD_BYTES = 0xF6, 0xF0, 6
-_XCP_PARAMETERS = 0x10000000
-"""Commands of XCP, and the address of the first parameter (firmware/comms/xcp.h)."""
+"""Commands of XCP (firmware/comms/xcp_code.h), and the bytes of one that writes a parameter."""
 _SILENT_PERIODS = 3
 """Periods of the commands, after which they have ceased."""
 
@@ -289,7 +289,7 @@ class _Reader:
         if data[:1] == bytes([_XCP_SET_MTA]):
             self._xcp_address = int.from_bytes(data[4:8], "little")
         elif data[:1] == bytes([_XCP_DOWNLOAD]) and len(data) >= _XCP_DOWNLOAD_BYTES:
-            index, rest = divmod(self._xcp_address - _XCP_PARAMETERS, 4)
+            index, rest = divmod(self._xcp_address - AREA_PARAMETERS, 4)
             self._xcp_address += data[1]
             if rest == 0 and 0 <= index < len(self._rows):
                 value = int.from_bytes(data[2:6], "little", signed=True)

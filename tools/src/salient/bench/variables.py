@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from salient.dbc import PHASES
@@ -104,3 +104,13 @@ def _unit_of(member: str) -> str:
         if member.endswith(end):
             return unit
     return ""
+
+
+def short_names(names: Mapping[int, str]) -> dict[int, str]:
+    """Names of an enumeration's values as telemetry has them: without the words that all of them begin with, in lower
+    case."""
+    words = [name.split("_") for name in names.values()]
+    shared = 0
+    while words and all(len(each) > shared + 1 and each[shared] == words[0][shared] for each in words):
+        shared += 1
+    return {value: "_".join(each[shared:]).lower() for value, each in zip(names, words, strict=True)}
