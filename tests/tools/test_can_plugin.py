@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import queue
+import select
 import socket
 import subprocess
 import sys
@@ -163,6 +164,20 @@ def test_listener_that_handles_the_end_is_not_called_without_pause(connect, monk
     assert seen == [(1.0, before), (1.0, before + 1), (1.0, before + 2)]
     reason = {"drive": "the drive has ended", "client": "this client was shut down"}[cause]
     assert all(str(error).endswith(reason) for error in listener.errors)
+
+
+def test_shutdown_by_another_thread_while_a_receiver_begins_to_wait_is_told_as_such(connect, monkeypatch):
+    bus = connect()
+    while bus.recv(0) is not None:
+        pass
+
+    def shut_down_first(*arguments):
+        bus.shutdown()
+        return select.select(*arguments)
+
+    monkeypatch.setattr(interface, "select", SimpleNamespace(select=shut_down_first))
+    with pytest.raises(can.CanOperationError, match="this client was shut down"):
+        bus.recv(0.0)
 
 
 def test_event_loop_reports_the_end_once(connect):

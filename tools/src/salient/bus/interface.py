@@ -206,7 +206,7 @@ class SalientBus(can.BusABC):
                 break
             except BlockingIOError:
                 left = None if deadline is None else max(0.0, deadline - time.monotonic())
-                if not select.select([], [self._socket], [], left)[1]:
+                if not self._is_ready([], [self._socket], left):
                     raise can.CanTimeoutError(f"{self.channel_info}: the emulator accepts no frames") from None
             except OSError as error:
                 raise self._gone() from error
@@ -222,7 +222,7 @@ class SalientBus(can.BusABC):
             try:
                 record = self._socket.recv(_RECEIVE_BYTES)
             except BlockingIOError:
-                if not select.select([self._socket], [], [], timeout)[0]:
+                if not self._is_ready([self._socket], [], timeout):
                     return None, False
                 continue
             except ConnectionResetError:
@@ -238,6 +238,14 @@ class SalientBus(can.BusABC):
             # Filtered here: with a timeout of 0, BusABC.recv would treat a frame that it filters out as the timeout.
             if self._filters is None or self._matches_filters(message):
                 return message, True
+
+    @staticmethod
+    def _is_ready(to_receive: list[socket.socket], to_send: list[socket.socket], timeout: float | None) -> bool:
+        """Waits for the socket. Also true when another thread has shut it down: its next call tells that."""
+        try:
+            return any(select.select(to_receive, to_send, [], timeout))
+        except (OSError, ValueError):
+            return True
 
     def _is_own_echo(self, frame: bytes) -> bool:
         for sent in (self._sent_on_bus, self._sent_immediate):
