@@ -5,13 +5,13 @@
 #   salient::firmware        the drive
 #   salient::machine_tables  reads the tables of the drive from a machine image
 #
-# and what they need. The include folders are those of the repository: "hal.h", "drive.h", "host/simulation.h", ...
+# and what they need. The include folders are the repository's: "hal.h", "drive.h", "host/simulation.h", ...
 
 include(${CMAKE_CURRENT_LIST_DIR}/salientTargets.cmake)
 set(SALIENT_MAIN ${CMAKE_CURRENT_LIST_DIR}/main.c ${CMAKE_CURRENT_LIST_DIR}/host_drive.c)
 
-# salient_add_drive(TARGET LAW.c...): an executable of the drive on its test bench, with these files in place of those of
-# the firmware that define the same functions: a file defines all functions of the one that it replaces. Files of other
+# salient_add_drive(TARGET LAW.c...): an executable of the drive on its test bench, with these files in place of the
+# firmware's that define the same functions: a file defines all functions of the one that it replaces. Files of other
 # names are added. As the firmware they are integer only, which the compiler checks on x86-64. The executable has the
 # command line and the CAN messages of the original, and pytest --salient-program tests it.
 function(salient_add_drive target)

@@ -40,7 +40,7 @@ void hal_adc_read(const hal_t *hal, hal_adc_sample_t *sample);
 #define HAL_ADC_INVERTER HAL_PHASES_MAX
 #define HAL_ADC_TEMPERATURES (2 * HAL_PHASES_MAX)
 
-/* Code of the last conversion, at most 2 ms old; those of phases that the machine does not have mean nothing.
+/* Code of the last conversion, at most 2 ms old; codes of phases that the machine does not have mean nothing.
  * [background] */
 uint16_t hal_adc_temperature(const hal_t *hal, unsigned sensor);
 

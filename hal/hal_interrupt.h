@@ -17,7 +17,7 @@ uint32_t hal_interrupt_missed_triggers(hal_t *hal);
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal);
 
 /* Requests the deferred interrupt: the port calls drive_deferred_interrupt once after the present control interrupt, at
- * a priority between that of the control interrupt, which pre-empts it, and the background. A request while one is
+ * a priority between the control interrupt, which pre-empts it, and the background. A request while one is
  * waiting has no effect; the drive makes none before the last call has returned. [control interrupt] */
 void hal_interrupt_request_deferred(hal_t *hal);
 

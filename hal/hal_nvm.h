@@ -1,4 +1,4 @@
-/* Non-volatile memory: pages of flash for data that survive a reset, apart from those of the program.
+/* Non-volatile memory: pages of flash for data that survive a reset, apart from the pages of the program.
  *
  * A page is erased as a whole, which sets all its bits; a word is programmed once after that. Both block the caller. On
  * a microcontroller whose program runs from the same flash they also stall the interrupts (STM32G431: 22 ms and 85 us),

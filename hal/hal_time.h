@@ -9,7 +9,7 @@
 /* Microseconds since start; wraps after 71 minutes. [any] */
 uint32_t hal_time_us(const hal_t *hal);
 
-/* The same by a second clock, that of the watchdog, with an oscillator of its own and from any beginning. [background]
+/* The same by a second clock, the watchdog's, with an oscillator of its own and from any beginning. [background]
  */
 uint32_t hal_time_reference_us(const hal_t *hal);
 

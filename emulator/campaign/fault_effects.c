@@ -19,8 +19,8 @@
  * as an error of phases or of the angle. */
 #define LINK_VOLTAGE (CAUSE_BIT(UNDER_VOLTAGE) | CAUSE_BIT(OVER_VOLTAGE) | PHASE | ENCODER)
 
-/* Judgements by a wrong limit or constant before the change is noticed may fail in any way; a state that is not
- * that of the checks, and a latch that is changed, may have any name. */
+/* Judgements by a wrong limit or constant before the change is noticed may fail in any way; a state that does
+ * not follow from the checks, and a latch that is changed, may have any name. */
 #define ANY UINT32_MAX
 
 #define WINDING_FAULT (DISTURBS_PHASE | DISTURBS_CURRENT_SHOWN)
@@ -43,7 +43,7 @@ static const fault_effect_t fault_effects[FAULT_COUNT] = {
     [FAULT_CURRENT_SENSOR_HIGH_RAIL] = {CURRENT_FAKED, PHASE | CURRENT | OVERLOAD, 2},
     [FAULT_CURRENT_SENSOR_GAIN] = {CURRENT_FAKED, PHASE | CURRENT | OVERLOAD, 0},
     [FAULT_CURRENT_SENSOR_OFFSET] = {CURRENT_FAKED, PHASE | CURRENT | OVERLOAD, 0},
-    /* The currents of other phases are those of another angle, or of the other direction. */
+    /* The currents of other phases belong to another angle, or to the other direction. */
     [FAULT_CURRENT_SENSOR_SWAPPED] = {CURRENT_SENSOR, PHASE | CURRENT | OVERLOAD | CAUSE_BIT(ENCODER_ANGLE), 0},
     [FAULT_DC_LINK_SENSOR_OPEN] = {DISTURBS_DC_LINK_SENSOR, CAUSE_BIT(UNDER_VOLTAGE), 2},
     [FAULT_DC_LINK_SENSOR_LOW_RAIL] = {DISTURBS_DC_LINK_SENSOR, CAUSE_BIT(UNDER_VOLTAGE), 2},
@@ -58,9 +58,9 @@ static const fault_effect_t fault_effects[FAULT_COUNT] = {
     [FAULT_ENCODER_NOISE] = {ANGLE, ENCODER, 0},
     /* About the angle of the reversal one phase looks as before, and two as if their currents were exchanged. */
     [FAULT_ENCODER_REVERSED] = {ANGLE, ENCODER, 0},
-    /* The angle is that of one phase's tolerance after the other, and then that of a current in another phase. */
+    /* The angle leaves the tolerance of one phase after the other, and then belongs to a current in another phase. */
     [FAULT_ENCODER_SLIP] = {ANGLE, ENCODER, 0},
-    /* The speed is that of the counts, where they jump. */
+    /* The speed follows the counts, where they jump. */
     [FAULT_ENCODER_LOST_COUNTS] = {ANGLE, ENCODER | CAUSE_BIT(OVER_SPEED), 0},
     [FAULT_ENCODER_NO_ANSWER] = {DISTURBS_ENCODER, ENCODER | CAUSE_BIT(STALL), 0}, /* its last angle stays */
     [FAULT_SHAFT_LOCKED] = {DISTURBS_SHAFT, ENCODER | OVERLOAD, 0},

@@ -10,7 +10,7 @@ enum {
     DISTURBS_PHASE = 1 << 0,               /* winding, switches or diodes */
     DISTURBS_PHASE_LOST = 1 << 1,          /* no current can be made in the phase */
     DISTURBS_CURRENT_SENSOR = 1 << 2,      /* a current sensor */
-    DISTURBS_CURRENT_SHOWN = 1 << 3,       /* a measured current is not that of the winding's terminals */
+    DISTURBS_CURRENT_SHOWN = 1 << 3,       /* a measured current is not the current of the winding's terminals */
     DISTURBS_THERMAL_MODEL = 1 << 4,       /* a measured current heats the drive's model of winding and switch */
     DISTURBS_DC_LINK_SENSOR = 1 << 5,      /* sensor of the link voltage */
     DISTURBS_ENCODER = 1 << 6,             /* the encoder */

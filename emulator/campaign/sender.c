@@ -137,7 +137,7 @@ static void put_session(sender_t *sender, const transport_receiver_t *receiver) 
     const world_machine_t *machine = sender->world->machine;
     switch (session(sender)) {
     case SESSION_LIMIT: {
-        /* In LSBs of 2^-24 of the unit of torque: a 256th of those of a command. */
+        /* In LSBs of 2^-24 of the unit of torque: a 256th of the LSBs of a command. */
         const double part = active(sender, WORLD_LIMITED)->value;
         const double raw = floor(part * machine->torque_max_Nm / machine->command_lsb_Nm) * 256.0;
         put_one_parameter(sender, receiver, sender->parameters.torque_max_Nm, (uint32_t)raw, 0);

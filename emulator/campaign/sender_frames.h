@@ -1,4 +1,4 @@
-/* Frames of the clients of a world, protected as the drive expects them, and those of the bench. */
+/* Frames of the clients of a world, protected as the drive expects them, and frames of the bench. */
 #ifndef CAMPAIGN_SENDER_FRAMES_H
 #define CAMPAIGN_SENDER_FRAMES_H
 

@@ -1,4 +1,4 @@
-/* Streams of random numbers of a seed; the index within one is that of the draw. */
+/* Streams of random numbers of a seed; the index within one is the number of the draw. */
 #ifndef CAMPAIGN_WORLD_STREAMS_H
 #define CAMPAIGN_WORLD_STREAMS_H
 

@@ -12,7 +12,7 @@ typedef enum { FMU_INSTANTIATED = 1, FMU_INITIALIZATION = 2, FMU_STEP = 4, FMU_T
 typedef struct {
     fmu_model_t model;
     fmu_mode_t mode;
-    double start_s;   /* start time of the importer; that of the plant is 0 */
+    double start_s;   /* start time of the importer; the plant's is 0 */
     uint64_t stop_ns; /* stop time of the plant; UINT64_MAX: none */
 } fmu_state_t;
 

@@ -175,7 +175,7 @@ void hal_watchdog_kick(hal_t *hal) {
     board_watchdog_kick(hal->board);
 }
 
-/* Code and stack are those of a process of the host. */
+/* Code and stack belong to a process of the host. */
 void hal_memory(const hal_t *hal, hal_memory_t *memory) {
     require(hal, false, __func__);
     *memory = (hal_memory_t){0};

@@ -11,7 +11,7 @@
  *       32         members of machine_tables_t, of machine_t, of flux_map_t (none unless the form is a map), and the
  *                  machine's name with a zero at its end
  *
- * The members are those of a validated machine file. Checked here is that the file is whole, of this version and
+ * The members come from a validated machine file. Checked here is that the file is whole, of this version and
  * unchanged, and whatever bounds an access to memory. */
 #ifndef HOST_MACHINE_IMAGE_H
 #define HOST_MACHINE_IMAGE_H

@@ -82,7 +82,7 @@ static void print_ready(const options_t *options, const char *machine) {
     fflush(stdout);
 }
 
-/* Content of the drive's memory; that of a file that does not exist yet is erased. */
+/* Content of the drive's memory; a file that does not exist yet stands for an erased one. */
 static bool read_memory(nvm_t *nvm, const char *path) {
     FILE *file = fopen(path, "rb");
     if (!file) {

@@ -271,7 +271,7 @@ MAGNETICS_INLINE void add_link_energies(plant_t *plant, const integrator_setting
 /* Within this distance of its threshold a comparator responds. */
 #define TRIP_TOLERANCE_A 1e-6
 
-/* Events in succession after steps as short as that are those of a current that either side of zero drives back: an
+/* Events in succession after steps as short as that come from a current that either side of zero drives back: an
  * earthed winding's, when the voltages of the others hold it there. A step of PASS_S then passes them, and leaves it at
  * zero or above. */
 #define CHATTER_EVENTS 8u
@@ -285,7 +285,7 @@ typedef struct {
     integrator_derivative_t first;
     integrator_integrals_t integrals;
     double at_s, length_s; /* its start after plant->time_ns; how long it is */
-    bool event, passes;    /* it ends at an event; it passes those of a current that chatters */
+    bool event, passes;    /* it ends at an event; it passes the events of a current that chatters */
     unsigned chatter;      /* events in succession */
 } common_step_t;
 

@@ -11,8 +11,8 @@
  * ended.
  *
  * Shorted turns: a fraction k of the turns is a loop of its own with the resistance k R, coupled with the others
- * without leakage. With the loop's current i_s and the current i of the terminals, the magnetomotive force is that of
- * i_m = (1 - k) i + k i_s in all turns, for which the magnetics hold: psi = psi(theta, i_m), and
+ * without leakage. With the loop's current i_s and the current i of the terminals, the magnetomotive force is as if
+ * i_m = (1 - k) i + k i_s flowed in all turns, for which the magnetics hold: psi = psi(theta, i_m), and
  *
  *   v = (1 - k) R i + (1 - k) d psi / dt,   0 = k R i_s + k d psi / dt
  *

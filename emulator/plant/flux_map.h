@@ -3,7 +3,7 @@
  *
  * Model: one function, the co-energy W(theta, i), a tensor product of uniform B-splines (C. de Boor, "A Practical Guide
  * to Splines", 1978), cubic in the angle from aligned to unaligned, quartic in the current from 0 to the maximum of the
- * map. Flux linkage dW/di, torque dW/dtheta and all other derivatives are those of this function: the model conserves
+ * map. Flux linkage dW/di, torque dW/dtheta and all other derivatives are taken from this function: the model conserves
  * energy, and only the integrator's own error remains. W is even about the aligned and about the unaligned position,
  * twice continuously differentiable in the angle and three times in the current; the second derivative of the torque
  * with respect to the angle jumps between intervals, slightly where the map is smooth.
@@ -27,7 +27,7 @@ typedef struct {
     double inductance_min_H; /* smallest incremental inductance, > 0 */
     double current_scale_A;  /* scale on which the inductance changes, at most four current steps; limits integration
                                 steps */
-    /* Coefficients of W: entry [j][k] is that of the product of the B-splines that start at current step j - 4 and
+    /* Coefficients of W: entry [j][k] belongs to the product of the B-splines that start at current step j - 4 and
      * angle step k - 3. */
     double coenergy_J[FLUX_MAP_CURRENT_INTERVALS + 4][FLUX_MAP_ANGLE_INTERVALS + 3];
 } flux_map_t;

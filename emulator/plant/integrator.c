@@ -2,7 +2,7 @@
 #include "plant/magnetics_kernel.h"
 
 /* The functions ending in _of are inlined for each form of the magnetics and for one and two conducting phases, so that
- * the compiler removes the other forms and unrolls the loops. `form`, `link` and `count` are those of the setting. */
+ * the compiler removes the other forms and unrolls the loops. `form`, `link` and `count` are the setting's. */
 
 /* Current that phases draw from the DC link, its first derivative at a constant voltage of the link, and its derivative
  * by that voltage, where some have shorted turns; link_A stays the current at the present voltage less the conductance

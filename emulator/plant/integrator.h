@@ -5,7 +5,7 @@
  *
  *   Y = y + h/2 f(y) + h^2/8 g(y),   y(t + h) = y + h f(y) + h^2/6 (g(y) + 2 g(Y))
  *
- * The second derivatives follow from those of the magnetics. A step evaluates the magnetics, which dominate its
+ * The second derivatives follow from the magnetics' derivatives. A step evaluates the magnetics, which dominate its
  * execution time, twice instead of four times as the classical method does. Energies are integrated by the same method.
  *
  * All states step together: with faults and where a comparator responds (common_steps.h). phase_steps.h has the other

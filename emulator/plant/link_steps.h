@@ -1,13 +1,13 @@
 /* Voltage of the DC-link capacitor while every phase has steps of its own (phase_steps.h).
  *
- * With the conductance g of source and chopper while they conduct, and a current i, that of the half bridges less
- * that of the source at 0 V:
+ * With the conductance g of source and chopper while they conduct, and a current i, the current of the half bridges
+ * less the current of the source at 0 V:
  *
  *   C dVdc/dt = -(i + g Vdc)
  *
  * i is a parabola between two instants at which a phase begins or ends a step. A step of the link leads from one to the
  * next, by the Taylor series of this equation. The phases take the integral of the voltage from it; what their charge
- * was more than that of the parabola is taken from the capacitor at the end of their steps.
+ * was more than the parabola's is taken from the capacitor at the end of their steps.
  *
  * Where the source or the chopper starts or stops conducting, the steps of all phases connected to the link end, and
  * once before, shortly ahead of it: from there the parabola leads to the instant exactly. */

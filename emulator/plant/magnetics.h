@@ -76,7 +76,7 @@ typedef struct {
     double torque_gradient_Nm_rad;    /* d torque / d theta */
 } magnetics_point_t;
 
-/* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must be those of a validated
+/* Prepares `model` for `magnetics` of a machine with `rotor_poles` poles. The values must come from a validated
  * machine file; they are not checked. */
 void magnetics_prepare(magnetics_model_t *model, const magnetics_t *magnetics, unsigned rotor_poles);
 

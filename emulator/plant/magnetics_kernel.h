@@ -76,7 +76,7 @@ MAGNETICS_INLINE double magnetics_kernel_wrap(const magnetics_model_t *model, do
     return phase_angle_rad - pitches * model->pitch_rad;
 }
 
-/* f at any phase angle. `form` is that of the model, a separate argument so that with a constant the compiler
+/* f at any phase angle. `form` is the model's, a separate argument so that with a constant the compiler
  * removes the other forms. */
 MAGNETICS_INLINE void magnetics_kernel_shape(const magnetics_model_t *model, magnetics_form_t form,
                                              double phase_angle_rad, double ahead_rad, magnetics_shape_t *shape) {

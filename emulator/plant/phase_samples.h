@@ -24,7 +24,7 @@ typedef struct {
 } phase_record_t;
 
 /* Takes the samples before `end_ns`, the step's end; its correction of the angle grows as the cube of the time. The
- * currents and the time of the plant stay those of the step's start. link: no steps without a DC link. */
+ * currents and the time of the plant stay as at the step's start. link: no steps without a DC link. */
 void phase_samples_take(plant_t *plant, const rotor_step_t *rotor, double correction_rad, const phase_record_t *records,
                         const link_record_t *link, uint64_t end_ns);
 

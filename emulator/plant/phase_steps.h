@@ -1,6 +1,6 @@
 /* Steps of the plant in which every phase has steps of its own: for a plant without faults.
  *
- * A phase's steps end at its own switching edges instead of those of all phases, and each evaluates its magnetics once
+ * A phase's steps end at its own switching edges instead of every phase's, and each evaluates its magnetics once
  * (integrator.h: all conducting phases, twice). The rotor's step reaches over all of them, as far as the limits of
  * its angle allow; usually it is a control period:
  *

@@ -278,7 +278,7 @@ MAGNETICS_INLINE void find_end(const plant_t *plant, const link_t *link, bool ti
     end->torque.start_1_s = walk->torque_Nm_s;
 }
 
-/* Newton's step from the predicted current, of which `point` is, to that of the flux linkage, and the magnetics
+/* Newton's step from the predicted current, of which `point` is, to the current of the flux linkage, and the magnetics
  * there. */
 MAGNETICS_INLINE void solve_end(double ohm, double speed_rad_s, magnetics_point_t *point, walk_end_t *end) {
     course_t *current = &end->current, *torque = &end->torque;

@@ -16,14 +16,14 @@
 #define STEP_CURRENT_FRACTION 0.09
 #define STEP_ANGLE_PITCHES 0.0015
 
-/* Fraction of the shortest time constant, among them those of a winding at its smallest inductance and of the free
- * rotor: where resistance or friction is large, longer Runge-Kutta steps lose accuracy, and beyond 2.8 stability. */
+/* Fraction of the shortest time constant, among them a winding's at its smallest inductance and the free
+ * rotor's: where resistance or friction is large, longer Runge-Kutta steps lose accuracy, and beyond 2.8 stability. */
 #define STEP_TIME_CONSTANTS 0.05
 
 /* With a DC link, where each phase has its own steps: fraction of the time constant sqrt(L C) of a phase that is
  * connected to it, with its present incremental inductance, and the capacitor. */
 #define LINK_STEP 0.0175
-/* And of that of the source's resistance and the capacitor. */
+/* Fraction likewise of the time constant of the source's resistance and the capacitor. */
 #define LINK_SOURCE_STEP 0.5
 
 /* Below 0 C: where the resistance of copper, extrapolated, is 0. */

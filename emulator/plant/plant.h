@@ -58,7 +58,7 @@ void plant_release(plant_t *plant);
  * rotor jump, without a counterpart in the energy balance, which holds over intervals without such a change. */
 void plant_set_gains(plant_t *plant, const plant_gains_t *gains);
 
-/* Sets the temperatures of the windings from time_ns on: the resistance of copper at T is that of the machine file, at
+/* Sets the temperatures of the windings from time_ns on: the resistance of copper at T is the machine file's, at
  * PLANT_RESISTANCE_C, times (235 C + T) / (235 C + PLANT_RESISTANCE_C) (IEC 60034-1, 8.6.2.3.3). T > -235 C; plant_init
  * sets PLANT_RESISTANCE_C. */
 void plant_set_winding_temperatures(plant_t *plant, const double temperature_C[HAL_PHASES_MAX]);

@@ -48,7 +48,7 @@ typedef struct {
 typedef struct {
     double link_gain, drop_V, resistance_ohm;       /* of the flux rate: q s, q V, q (R + r / (1 - k)) */
     double terminal_gain, terminal_S;               /* of the terminals' current: by i_m, by the flux rate */
-    double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown, that of arc and avalanche */
+    double sign, device_V, device_ohm, breakdown_V; /* s; V and r without the breakdown of arc and avalanche */
 } plant_path_t;
 
 /* State of a phase between the steps of phase_steps.h. */
@@ -151,7 +151,7 @@ double plant_current_A(const plant_t *plant, unsigned phase);
 /* Electromagnetic torque, sum of all phases. */
 double plant_torque_Nm(const plant_t *plant);
 
-/* Torque that the shaft takes, as a torque transducer on it shows: that of the load and of a dynamometer. */
+/* Torque that the shaft takes, as a torque transducer on it shows: the torque of the load and of a dynamometer. */
 double plant_shaft_torque_Nm(const plant_t *plant);
 
 /* Mechanical angle relative to the aligned position of a phase (0 and every pole pitch), not wrapped. */
@@ -172,7 +172,7 @@ static inline bool plant_has_link(const plant_t *plant) {
     return plant->machine->dc_link.capacitance_F > 0.0;
 }
 
-/* Current at the terminals of a phase with faults, by that of its turns. */
+/* Current at the terminals of a phase with faults, by the current of its turns. */
 static inline double plant_path_terminal_A(const plant_path_t *path, double bus_voltage_V, double current_A) {
     const double flux_rate_V = path->link_gain * bus_voltage_V - path->drop_V - path->resistance_ohm * current_A;
     return path->terminal_gain * current_A + path->terminal_S * flux_rate_V;

@@ -41,7 +41,7 @@ typedef enum {
 typedef struct {
     bool held; /* the converter reads `code`, at most its largest count */
     uint16_t code;
-    bool scaled; /* gain and offset (in the sensor's unit) after those of all sensors, before noise */
+    bool scaled; /* gain and offset (in the sensor's unit) after the common ones of all sensors, before noise */
     double gain, offset;
 } sensors_input_fault_t;
 
@@ -78,7 +78,7 @@ typedef struct {
         int64_t boundary; /* number of the count above it, continued over revolutions */
         double time_ns;
     } edge;
-    bool latched; /* the members below are those of the previous latch */
+    bool latched; /* the members below belong to the previous latch */
     double latch_time_ns, latch_angle_rad, latch_speed_rad_s;
     uint64_t random_state;
     struct {

@@ -46,7 +46,7 @@ static void resume_drive(void) {
 
 /* --- Mailbox of an image that is compiled for fewer phases --- */
 
-#define IMAGE_PHASES 4 /* those of an image for a machine of no more */
+#define IMAGE_PHASES 4 /* phases of an image for a machine of no more */
 #define PER_PHASE sizeof(uint16_t)
 
 static_assert(sizeof mailbox->compare.upper == HAL_PHASES_MAX * PER_PHASE &&

@@ -2,8 +2,8 @@
  *
  * Instructions of each control interrupt and of each deferred interrupt, from the first of the handler to its return,
  * both included: exact, and equal on every computer. Exception entry and return by the hardware are not counted, nor
- * are the instructions of control interrupts that pre-empt a deferred one; those of another handler are (with
- * instruction timing that of the timer, about 60 for each trigger).
+ * are the instructions of control interrupts that pre-empt a deferred one; another handler's are (with
+ * instruction timing the timer's, about 60 for each trigger).
  */
 #ifndef INSTRUCTIONS_H
 #define INSTRUCTIONS_H

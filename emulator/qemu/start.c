@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
  * Starts QEMU with the image of a drive and the co-simulation host as plugin, in the same process:
- * command line, ready line and exit codes are those of the host executable.
+ * command line, ready line and exit codes are the host executable's.
  */
 #define _GNU_SOURCE /* memfd_create */
 
@@ -65,7 +65,7 @@ static const board_description_t *board_of(const char *image) {
     return NULL;
 }
 
-/* Options of this program, which precede those of the host executable. */
+/* Options of this program, which precede the options of the host executable. */
 enum { INSTRUCTIONS, DEFERRED_INSTRUCTIONS, EXECUTION, INSTRUCTION_NS, OPTIONS };
 #define VALUES_MAX 2
 

@@ -76,7 +76,7 @@ static void returns(unsigned vcpu, void *block) {
 static void stored(unsigned vcpu, qemu_plugin_meminfo_t info, uint64_t address, void *context) {
     (void)vcpu;
     (void)context;
-    /* QEMU 7.2 also reports loads (here: those of the self-test, of words that were never used). */
+    /* QEMU 7.2 also reports loads (here: the self-test's, of words that were never used). */
     if (!qemu_plugin_mem_is_store(info) || address < stack_end || address >= stack_begin) {
         return;
     }

@@ -43,7 +43,7 @@ typedef struct {
     uint32_t missed_triggers;   /* since last read */
     bool renewed;               /* compare values were written or cleared since the start of the period */
     uint32_t periods_unrenewed; /* in succession, up to the start of the present one */
-    uint32_t break_causes;      /* latched, HAL_PWM_BREAK_*; that of the comparators is plant.tripped */
+    uint32_t break_causes;      /* latched, HAL_PWM_BREAK_*; the comparators' is plant.tripped */
     bool sto_energised[BOARD_STO_LINES];
     uint64_t interrupt_took_ns; /* execution time of the present control interrupt, from its trigger on: set by the rig,
                                    overwritten before its end by a port with instruction timing */

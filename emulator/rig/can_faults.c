@@ -2,7 +2,7 @@
 
 #include "plant/random.h"
 
-#define STREAM UINT64_C(0x63616E5F66617565) /* distinguishes this stream from that of the sensors' noise */
+#define STREAM UINT64_C(0x63616E5F66617565) /* distinguishes this stream from the stream of the sensors' noise */
 
 void can_faults_init(can_faults_t *faults, uint64_t seed) {
     *faults = (can_faults_t){.fault = CAN_FAULT_NONE, .per_mille = 1000, .random_state = seed ^ STREAM};

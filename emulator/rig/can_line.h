@@ -32,7 +32,7 @@ typedef struct {
 } can_line_t;
 
 /* Outcome of the frame of the transmitters, which begins, and when. Without a node that acknowledges it, it ends
- * with an error. `wires` has room for those of all transmitters. */
+ * with an error. `wires` has room for the wires of all transmitters. */
 void can_line_plan_frame(can_line_t *line, bool acknowledged, const can_length_t *lengths, can_faults_t *faults,
                          can_wire_t *wires);
 

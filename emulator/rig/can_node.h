@@ -18,7 +18,7 @@ typedef struct {
     hal_can_frame_t frame;
     uint32_t arbitration; /* can_node_arbitration of the frame */
     bool taken;
-    bool drawn; /* `fault` is that of this frame */
+    bool drawn; /* `fault` is this frame's */
     can_fault_t fault;
     uint64_t request;       /* sequence number of the request */
     uint64_t not_before_ns; /* takes no part in arbitration earlier */

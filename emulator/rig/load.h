@@ -1,7 +1,7 @@
 /* The load on the shaft: load_torque_Nm, which steps or ramps, plus a sine over time, plus a profile over the angle.
  *
  * A load that moves is a staircase: EVENT_LOAD sets the torque each LOAD_STEP_NS of virtual time to its exact value at
- * that instant, where it stays until the next event. On average it is half a step late; the profile, which is that of
+ * that instant, where it stays until the next event. On average it is half a step late; the profile, which is taken at
  * the true angle half a step later, is not. Without a sine, a ramp or a profile there are no events, and the plant is
  * advanced as if this file did not exist.
  */

@@ -1,7 +1,7 @@
 /* Emulated flash: pages, words that are programmed once, erasure, and the loss of power at any operation.
  *
  * Operations are programmings and erasures. A cut at operation n (the n-th from when it is set, from 1) leaves it as
- * the kind says, and no later operation has an effect until nvm_power_on. Random bits are those of the seeded sequence.
+ * the kind says, and no later operation has an effect until nvm_power_on. Random bits come from the seeded sequence.
  *
  *   kind    word that was being programmed        page that was being erased
  *   old     as before                             as before

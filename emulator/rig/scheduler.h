@@ -1,7 +1,7 @@
 /* Discrete-event scheduler: a due time and a handler for each event. Next event first, one thread.
  *
- * Events that are due at the same instant are handled in the order of scheduler_event_t, those of one kind in the order
- * of the list of schedulers.
+ * Events that are due at the same instant are handled in the order of scheduler_event_t, and of one kind in the
+ * order of the list of schedulers.
  */
 #ifndef RIG_SCHEDULER_H
 #define RIG_SCHEDULER_H

@@ -1,5 +1,5 @@
 /* The voltage of the supply: supply_voltage_V of the bench, and its faults. Ripple is a staircase: EVENT_SUPPLY sets
- * the voltage each SUPPLY_STEP_NS to that of the middle of the step. */
+ * the voltage each SUPPLY_STEP_NS to the value in the middle of the step. */
 #ifndef RIG_SUPPLY_H
 #define RIG_SUPPLY_H
 

@@ -21,8 +21,8 @@ typedef struct {
  * so that equal frames have equal bytes. A classic length of 9 to 15 becomes length 8 with len8_dlc. */
 bool transport_frame_accept(transport_frame_t *frame, size_t received);
 
-/* Bits of the identifiers of a rig that have the node number of its drive; not those of time, which all drives of a bus
- * share (RIG_RUN_UNTIL, RIG_CLOCK, RIG_STAMP). */
+/* Bits of the identifiers of a rig that have the node number of its drive; not messages of time, which all drives of
+ * a bus share (RIG_RUN_UNTIL, RIG_CLOCK, RIG_STAMP). */
 #define TRANSPORT_NODE_SHIFT 8
 #define TRANSPORT_NODE_MASK (7u << TRANSPORT_NODE_SHIFT)
 
@@ -31,7 +31,7 @@ static inline unsigned transport_frame_node(const transport_frame_t *frame) {
     return (frame->classic.can_id & TRANSPORT_NODE_MASK) >> TRANSPORT_NODE_SHIFT;
 }
 
-/* The identifier of node 0 becomes that of another one. */
+/* The identifier of node 0 becomes another node's. */
 static inline void transport_frame_set_node(transport_frame_t *frame, unsigned node) {
     frame->classic.can_id |= node << TRANSPORT_NODE_SHIFT;
 }

@@ -350,7 +350,7 @@ static bool remove_stale(const char *path, const struct sockaddr_un *address, ch
     return true;
 }
 
-/* Binds a socket whose file only its owner can connect to, whatever the umask: its mode is that of the descriptor,
+/* Binds a socket whose file only its owner can connect to, whatever the umask: its mode is the descriptor's,
  * which leaves no moment in which it is another one; the umask, of the whole process, could only take bits from it. */
 static bool bind_private(int listener, const struct sockaddr_un *address) {
     return fchmod(listener, S_IRUSR | S_IWUSR) == 0 &&

@@ -1,4 +1,4 @@
-/* A request to stop makes the rotor no faster, and brings that of a drive of four quadrants to rest while it is heard:
+/* A request to stop makes the rotor no faster, and brings the rotor of a four-quadrant drive to rest while it is heard:
  * 100 ms after the time that half of the torque limit needs. */
 #include "campaign/checkers/checker.h"
 

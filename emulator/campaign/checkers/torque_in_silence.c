@@ -6,7 +6,7 @@
 
 enum { TORQUE = 4, GROWN = 7 };
 
-#define KNOWN_NS (55 * MS_NS) /* the torque until then is that of the run */
+#define KNOWN_NS (55 * MS_NS) /* the torque until then is the run's */
 #define FRESH_NS (10 * MS_NS)
 #define GROWTH_NS (65 * MS_NS)
 #define RAMP_NS (170 * MS_NS)

@@ -1,4 +1,4 @@
-/* Speed, link voltage and largest current in the snapshot of a fault are those of its instant. */
+/* Speed, link voltage and largest current in the snapshot of a fault are the values at its instant. */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -69,7 +69,7 @@ static noreturn void run(void) {
     }
 }
 
-/* Far enough below the present frame for those of the calls here. The plugin's trace knows it by its name. */
+/* Far enough below the present frame for the frames of the calls here. The plugin's trace knows it by its name. */
 __attribute__((noipa)) void stack_paint(void) {
     volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
     for (volatile uint32_t *word = stack_end; word < end; word++) {

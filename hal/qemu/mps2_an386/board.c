@@ -62,7 +62,7 @@ void board_interrupt_enable(void) {
     NVIC_IPR(CONTROL_IRQ) = 0; /* highest configurable priority */
     NVIC_ISER0 = UINT32_C(1) << CONTROL_IRQ;
     if (board.mailbox.timed && board.mailbox.period_ticks > 0) {
-        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt pre-empts that of the timer */
+        NVIC_IPR(TIMER_IRQ) = 0x80; /* lower: the control interrupt pre-empts the timer's */
         NVIC_ISER0 = UINT32_C(1) << TIMER_IRQ;
         timer_start(board.mailbox.period_ticks);
     }
@@ -73,7 +73,7 @@ void board_interrupt_pend(void) {
     __asm__ volatile("dsb\n\tisb" ::: "memory");
 }
 
-/* Masks all interrupts: there are only the two of the drive and that of the timer, which requests the control
+/* Masks all interrupts: there are only the two of the drive and the timer's, which requests the control
  * interrupt.
  */
 void hal_critical_enter(hal_t *hal) {

@@ -10,7 +10,7 @@
 #define FINISHER_FAIL 0x3333
 
 /* RISC-V ACLINT specification, first hart. The software interrupt is the control interrupt. The timer interrupt, whose
- * priority is below that of the software interrupt, is the deferred interrupt: it is requested while the time of the
+ * priority is below the software interrupt's, is the deferred interrupt: it is requested while the time of the
  * timer is not below mtimecmp. The lower half stays 0, so that one store of the upper half requests it or clears the
  * request. */
 #define ACLINT_MSIP (*(volatile uint32_t *)0x02000000)
