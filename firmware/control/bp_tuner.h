@@ -23,7 +23,7 @@ typedef struct {
     int32_t gain_q24[BP_OUTPUTS]; /* kp, ki, kd, duty per scaled error, Q7.24, 0..4 */
 } bp_tuner_t;
 
-/* Initial weights from the seed, gains at half of their scales: those of an error of 0. [deferred interrupt] */
+/* Initial weights from the seed, gains at half of their scales: the gains of an error of 0. [deferred interrupt] */
 void bp_tuner_reset(const bp_pid_parameters_t *parameters, bp_tuner_t *tuner);
 
 /* One sample of the PID, which is handed over once. Gains are rounded to nearest. [deferred interrupt] */

@@ -2,7 +2,7 @@
  *
  * Angles of a phase in 2^-32 electrical rev, an electrical revolution being a rotor pole pitch: 0 aligned, 2^31
  * unaligned (45 mechanical degrees of 90 in the paper). Angle control of a switched reluctance machine is textbook (T.
- * J. E. Miller, "Switched Reluctance Motors and Their Control", 1993); the default angles are those of the paper.
+ * J. E. Miller, "Switched Reluctance Motors and Their Control", 1993); the default angles are the paper's.
  *
  * Conduction windows follow each other without gap when turn-off - turn-on = 1 rev / phases, as 45 and 75 degrees of
  * the paper do. A phase past its window stays available as outgoing phase until `outgoing_off`, because a hard turn-off

@@ -28,7 +28,7 @@ _Static_assert(CONDUCTION_ANGLES + 1 == CONDUCTION_STEPS, "the last step");
 /* Overlap of a pulse, 8 degrees. */
 #define PULSE_OVERLAP_MIN (4 * OVERLAP_MIN)
 
-/* Rate of the braking limit's slow part, from that of the advance, Q1.30 to Q1.15: 5/8 in a second by each fold-back
+/* Rate of the braking limit's slow part, from the advance's, Q1.30 to Q1.15: 5/8 in a second by each fold-back
  * range that the DC link has free, of which LINK_RANGES count; and by which it is faster where the link is full. */
 #define LINK_SHIFT 19
 #define LINK_RANGES 8
@@ -207,7 +207,7 @@ static int32_t feed_forward_q15(const conduction_pulse_t *pulse, int32_t torque)
 }
 
 /* Above T_smooth the windows advance: at once from a level of 0; step by step from one that the trim alone has made, so
- * that they do not jump. level_q15 is still that of the last update. */
+ * that they do not jump. level_q15 is still the last update's. */
 static void advance_for_pulse(const conduction_parameters_t *parameters, conduction_state_t *state,
                               int32_t forward_q15) {
     if (forward_q15 > 0) {
@@ -236,7 +236,7 @@ static void move_level(const conduction_parameters_t *parameters, conduction_sta
         const int32_t forward_q30 = forward_q15 * (1 << 15);
         advance_for_pulse(parameters, state, forward_q15);
         if (forward_q15 == ONE_Q15) {
-            state->trim_q30 = 0; /* the largest torque is that of the tables */
+            state->trim_q30 = 0; /* the largest torque is the tables' */
         } else if (state->advance_q30 == ONE_Q30 && (limited || state->level_q15 > 0)) {
             /* Sharing follows the reference at any level that is too high: without a shortfall it returns. */
             state->trim_q30 += trim_step_q30(state, update, sample) - (forward_q15 == 0 ? retract_q30 : 0);
@@ -265,7 +265,7 @@ static conduction_interval_t sharing_interval(const conduction_parameters_t *par
     };
 }
 
-/* Positions and ripple between those of torque sharing and of the single pulse. */
+/* Positions and ripple between torque sharing's and the single pulse's. */
 static inline void blend_single_pulse(const conduction_pulse_t *pulse, int32_t level_q15,
                                       conduction_interval_t *interval, int32_t *ripple_q24) {
     interval->on = blend(interval->enter < HALF_REV ? interval->enter : 0, -pulse->lead, level_q15);
@@ -287,7 +287,7 @@ static void move_part(const conduction_parameters_t *parameters, conduction_stat
     const int32_t forward_q30 = part_of_largest_q15(&update->pulse, state->torque_q24) * (1 << 15);
     advance_for_pulse(parameters, state, forward_q15);
     if (forward_q15 == ONE_Q15) {
-        state->trim_q30 = 0; /* the largest torque is that of the tables */
+        state->trim_q30 = 0; /* the largest torque is the tables' */
     } else if (!limited && !state->single_pulse) {
         state->trim_q30 -= fixed_clamp(state->trim_q30, -parameters->advance_step_q30, parameters->advance_step_q30);
     } else {
@@ -302,8 +302,8 @@ static void move_part(const conduction_parameters_t *parameters, conduction_stat
     advance_for_shortfall(parameters, state, limited, limited ? 0 : parameters->retract_step_q30 >> ABOVE_BASE_SHIFT);
 }
 
-/* Positions and ripple between those of the law below base speed and of the partial pulse. True if that pulse makes the
- * torque pulsate, or begins before the half. */
+/* Positions and ripple between the law's below base speed and the partial pulse's. True if that pulse makes the torque
+ * pulsate, or begins before the half. */
 static inline bool blend_partial_pulse(const conduction_state_t *state, const conduction_update_t *update,
                                        conduction_interval_t *interval, int32_t *ripple_q24) {
     const int32_t partial_q15 = state->partial_q15;

@@ -1,9 +1,9 @@
 /* Conduction angles of the phases: torque sharing and single pulse operation.
  *
- * Windows of torque sharing are those of the machine with the least copper loss, from tables over the torque and the
+ * Windows of torque sharing are the machine's with the least copper loss, from tables over the torque and the
  * speed / voltage (tools/src/salient/machine/sharing_window.py), up to the base speed
  *
- *   on, off = (1 - w) still(T) + w base(T),   w = speed / voltage over that of the base speed, at most 1
+ *   on, off = (1 - w) still(T) + w base(T),   w = speed / voltage over its value at base speed, at most 1
  *
  * with straight lines over the torque T between quarters of the largest one that a window makes at every angle. The
  * angle in which a voltage builds up a flux linkage is proportional to speed / voltage: that is how far they begin and
@@ -24,7 +24,7 @@
  *
  * with angles past the begin of that half, and T the mean of the reference over about a stroke. T_smooth is the largest
  * torque without lead and without ripple, T_mean the largest mean torque. The trim is the integral over the angle of
- * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque that of
+ * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque equal
  * the reference. It begins where a shortfall has lasted, above base speed at once: the way by the advance is longer and
  * leaves up to 5 % of the torque missing. With single pulses the torque
  * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
@@ -53,9 +53,9 @@
  *   on -= (1 - k^2) part (end_max - lead_max),   |T| <= min(1, (1 + 3 part) k) T_mean
  *
  * At k = 0 a pulse of the largest torque would begin as far before the aligned position as it ends after it, without a
- * torque. Its current stays that of the largest one: the windings dissipate what a chopper does not take. Where the
- * fields of a phase would fill the link at the voltage that it is held at, |T| <= k T_mean instead, as below base
- * speed.
+ * torque. Its current stays as large as at the largest torque: the windings dissipate what a chopper does not take.
+ * Where the fields of a phase would fill the link at the voltage that it is held at, |T| <= k T_mean instead, as below
+ * base speed.
  *
  * The torque follows the reference once in a stroke. A speed law with a gain k of the order of the stroke rate f makes
  * every second pulse larger: the error is multiplied by 1 - k / f from stroke to stroke. From base speed on its gain is

@@ -1,5 +1,5 @@
-/* Course of the counts: the angle that the speed reference has gone through, so that the mean speed is that of the
- * counts.
+/* Course of the counts: the angle that the speed reference has gone through, so that the mean speed is the
+ * counts'.
  *
  * While counts are slow, the estimate of the speed lives on the model for most of the time, and each error of the
  * torque, which adds up twice between two edges, makes it wrong. The estimate of the angle does not: it is within the

@@ -1,6 +1,6 @@
 /* Misalignment by flux linkage: the angle that the encoder is off by, from the phases alone, whatever the load does.
  *
- * The flux linkage that the voltage has built up in a phase (flux_residual.h) differs from that of the tables at the
+ * The flux linkage that the voltage has built up in a phase (flux_residual.h) differs from the tables' at the
  * measured current and angle, psi, by
  *
  *   psi - psi(voltage) = delta D + a psi + b (integral of R i) + c t,   D = psi(angle + s / 2) - psi(angle - s / 2)
@@ -39,7 +39,7 @@ typedef struct {
  * sums are to be solved. [background] */
 bool flux_angle_add(flux_angle_t *flux_angle, const flux_residual_t *residual, unsigned index);
 
-/* Misalignment, 2^-32 electrical rev; 0 when the samples do not tell it from the other errors, or are those of a part
+/* Misalignment, 2^-32 electrical rev; 0 when the samples do not tell it from the other errors, or come from a part
  * of a conduction. [background] */
 int32_t flux_angle_solve(const flux_angle_t *flux_angle);
 

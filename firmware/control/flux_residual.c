@@ -40,7 +40,7 @@ int32_t flux_residual_most_q29(const flux_residual_t *residual, unsigned index) 
     return fixed_add(phase->flux_q29, slack_q29(residual, phase, cold_q29));
 }
 
-/* Periods since the phase was at rest, those of a small current twice; what lies further back than the time constant
+/* Periods since the phase was at rest, periods of a small current twice; what lies further back than the time constant
  * has been corrected. */
 static uint32_t conducting(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
     const uint32_t follow = FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms;
@@ -69,7 +69,7 @@ static bool at_rest(const flux_residual_t *residual, flux_residual_phase_t *phas
     return phase->rest_q29 >= fixed_add(fixed_add(phase->peak_q29 / 4, residual->delay_q29), remains_q29);
 }
 
-/* An integral that saturates, as that of a phase which holds a load for half a second at another resistance. */
+/* An integral that saturates, as of a phase which holds a load for half a second at another resistance. */
 static bool saturated(int32_t flux_q29) {
     return fixed_magnitude(flux_q29) >= INT32_MAX;
 }

@@ -69,7 +69,7 @@ typedef struct {
     /* Over samples: */
     uint32_t zero_at;          /* period in which the phase was last without current, before this sample */
     int32_t peak_q29;          /* largest flux linkage since the phase was at rest, Wb, Q2.29 */
-    uint32_t conducting;       /* periods since then, up to the time constant; twice those of a small current */
+    uint32_t conducting;       /* periods since then, up to the time constant; of a small current twice */
     int32_t followed_q29;      /* sum of the corrections of psi(f) since it was without current, Wb, Q2.29 */
     int32_t followed_drop_q29; /* the integral of R i with the corrections that psi(f) has had, Wb, Q2.29, >= 0 */
     int32_t rest_q29;          /* what the opposite voltage would have removed since psi(f) has been 0, Wb, Q2.29 */
@@ -96,7 +96,7 @@ typedef struct {
     int32_t least_q29, most_q29;
 } flux_band_t;
 
-/* Takes a sample in. False, and nothing else, when it is that of the period before. [background] */
+/* Takes a sample in. False, and nothing else, when it is the sample of the period before. [background] */
 bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sample);
 
 /* Ends a sample: what psi(f) has to be corrected by, Wb, Q2.29, for each phase. [background] */

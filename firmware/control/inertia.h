@@ -20,7 +20,7 @@
  *
  * The result is the shift k of J0 / J = 2^k, within -2..2: J = J0 / 5 and J = 5 J0 then differ from 2^-k J0 by a
  * quarter. It changes by one at a time, when the regression is off by more than 1.75 or 1 / 1.6. A machine as its
- * parameters state stays at k = 0, where the laws are those of the parameters.
+ * parameters state stays at k = 0, where the laws are the parameters'.
  */
 #ifndef CONTROL_INERTIA_H
 #define CONTROL_INERTIA_H
@@ -77,7 +77,7 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings);
 void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
                      uint32_t angle);
 
-/* The laws of changed parameters, which are not those of another inertia. */
+/* The laws of changed parameters, which do not mean another inertia. */
 void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
 
 /* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24, in the mean since the last

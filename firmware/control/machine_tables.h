@@ -100,7 +100,7 @@ typedef struct {
     uint8_t speed_exponent;    /* w, 0..3 */
     uint16_t current_range_q9; /* full scale of the current sensors, A, unsigned Q7.9 */
     uint16_t voltage_range_q6; /* full scale of the DC-link voltage divider, V, unsigned Q10.6 */
-    /* Two devices carry the current of a phase: those of the worse kind, switches or diodes. */
+    /* Two devices carry the current of a phase: two of the worse kind, switches or diodes. */
     uint16_t device_drop_most_q6;  /* threshold, V, Q10.6 */
     uint16_t device_resistance_q8; /* slope, parts of the resistance of the winding, Q8.8, up to 64 */
     uint16_t minimum_pulse_ns;     /* of the converter; shorter pulses and gaps of a switch do not act, 0..2000 */

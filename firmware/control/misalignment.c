@@ -117,7 +117,7 @@ static inline int32_t growing_mean_q16(const misalignment_parameters_t *paramete
     return gain_q16 > parameters->mean_q16 ? gain_q16 : parameters->mean_q16;
 }
 
-/* The phase to update; the next one is that of the next step. */
+/* The phase to update; the next step takes the next one. */
 static inline misalignment_phase_t *take_phase(misalignment_t *misalignment, const machine_tables_t *tables) {
     const unsigned index = misalignment_phase_index(misalignment);
     misalignment->phase_index = index + 1 < tables->phases ? index + 1 : 0;

@@ -13,7 +13,7 @@
  *   d delta_j / dt = rate y s_j / (mean of sum s_j^2 + 0.05 T^2 / rad^2)
  *
  * A misaligned encoder displaces all phases by the same angle, and its y is delta sum s_j, which is small because the
- * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than those of the
+ * slopes of two overlapping phases nearly cancel, and at high speeds much smaller after the observer than the y of the
  * phases, which alternate more slowly. So the same law learns that angle once more, normalised by itself:
  *
  *   d delta / dt = rate / 2 y S / (mean of S^2 + 0.00007 T^2 / rad^2 + N),   S = sum s_j
@@ -155,8 +155,8 @@ void misalignment_follow_flux(const misalignment_parameters_t *parameters, misal
 /* Sum of the phases' slopes at their last updates, N m per 0.02 rad, Q7.24, saturates. */
 int32_t misalignment_slope_q24(const misalignment_t *misalignment);
 
-/* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest, those of low-passes
- * to 2 LSB, that of misalignment_follow_flux() down; quotients are rounded towards zero, means down; sums saturate,
+/* One sample, after load_observer_step(); updates one phase. 64-bit products, rounded to nearest, in low-passes
+ * to 2 LSB, in misalignment_follow_flux() down; quotients are rounded towards zero, means down; sums saturate,
  * offsets are clamped to +-3.5 of 0.02 rad (4 degrees). */
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample);

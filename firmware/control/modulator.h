@@ -12,8 +12,8 @@
 
 #define MODULATOR_DUTY_ONE_Q15 32768
 
-/* Sets the compare values of phases 0..phases - 1 for a timer period of period_ticks (1..32767); those of the other
- * phases are unchanged.
+/* Sets the compare values of phases 0..phases - 1 for a timer period of period_ticks (1..32767); the other phases
+ * keep theirs.
  *
  * Not interleaved: at 0..+1 the lower switch is on and the upper one is modulated, at -1..0 the upper switch is off and
  * the lower one is modulated. Each switch switches at most once per period.

@@ -1,4 +1,4 @@
-/* Moving load: a load that changes all the time, as that of a piston compressor, detected by the trend of the
+/* Moving load: a load that changes all the time, as a piston compressor's does, detected by the trend of the
  * innovation.
  *
  * The load observer assumes a constant load. Under one that changes at a rate r its innovation has the mean
@@ -30,7 +30,7 @@
  * 0.8 s. The value 1/8 is found by trial: one of 1/11 takes the ripple of an encoder that is 0.05 degrees off for a
  * moving load, with one of 3/16 tables that are 5 % wrong make finite_element swing.
  *
- * The last stage is that of a beat (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend. A
+ * The last stage is the beat's (observer_bandwidth.h), so narrow that the ripple of wrong tables has a trend. A
  * trend in it withholds this stage alone; the load moves when there is a trend in the steady stage as well.
  *
  * A load step is no moving load. The observer is wide after its trigger anyway, and the trend that it leaves is not one
@@ -61,7 +61,7 @@ typedef struct {
     int64_t trend_q36;   /* low-pass of the innovation, 2^-32 rev, Q27.36 */
     uint32_t hold_ticks; /* next hold, periods; 0: the shortest */
     uint32_t ticks;      /* until the next release */
-    uint32_t settling;   /* periods in which the trend may be that of a narrower bandwidth */
+    uint32_t settling;   /* periods in which the trend may come from a narrower bandwidth */
     uint32_t withheld;   /* stages */
     bool releasing;      /* no trend since a stage was released */
     bool first;          /* none had been withheld lately, and nothing has triggered since */
@@ -85,7 +85,7 @@ moving_load_parameters_t moving_load_configure(const moving_load_settings_t *set
 
 /* One sample: largest trend that rounding to counts causes, 2^-32 rev, Q28.4, at a rotation per period (angle_step,
  * magnitude, 2^-32 rev), by the formula above; |q r - p| is rounded down to 2^-15 count, n to quarters, the result to 1
- * LSB. One of q = 1..6 a sample, so the result is that of up to 11 samples ago. A 32-bit division in every sixth. */
+ * LSB. One of q = 1..6 a sample, so the result is up to 11 samples old. A 32-bit division in every sixth. */
 uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, moving_load_rounding_t *rounding,
                                  uint32_t angle_step);
 

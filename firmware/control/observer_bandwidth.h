@@ -4,11 +4,11 @@
  *
  * A fixed bandwidth cannot have both a small ripple (it passes the encoder's quantisation on to speed and torque
  * reference) and a small speed drop after a load step (the load must be detected first). An innovation beyond a
- * threshold triggers the transient bandwidth, which then decays as that of an estimator which restarts with the trigger
+ * threshold triggers the transient bandwidth, which then decays as an estimator's does which restarts with the trigger
  * and weights all samples since equally: the expanding-memory polynomial filter of degree 2 (N. Morrison, "Introduction
- * to Sequential Smoothing and Prediction", McGraw-Hill, 1969), with its gains 9/t, 36/t^2, 60/t^3. Those of a triple
- * pole at w0 = a / t are 3 a/t, 3 a^2/t^2, a^3/t^3. What was wrong at the trigger decays then as t^s (derived here),
- * with
+ * to Sequential Smoothing and Prediction", McGraw-Hill, 1969), with its gains 9/t, 36/t^2, 60/t^3. The gains of a
+ * triple pole at w0 = a / t are 3 a/t, 3 a^2/t^2, a^3/t^3. What was wrong at the trigger decays then as t^s (derived
+ * here), with
  *
  *   (s + 3 a) (s - 1) (s - 2) + 3 a^2 (s - 2) + a^3 = 0
  *
@@ -51,8 +51,8 @@
 #include "control/load_observer.h"
 #include "fixed/fixed.h"
 
-/* Stages of the decay, each with 13/16 of the bandwidth before, but for the last ones: the steady bandwidth, and that
- * of a beat, which is withheld without one. */
+/* Stages of the decay, each with 13/16 of the bandwidth before, but for the last ones: the steady bandwidth, and the
+ * beat's, which is withheld without one. */
 #define OBSERVER_BANDWIDTH_STAGES 19u
 #define OBSERVER_BANDWIDTH_STEADY_STAGE (OBSERVER_BANDWIDTH_STAGES - 2)
 #define OBSERVER_BANDWIDTH_BEAT_STAGE (OBSERVER_BANDWIDTH_STAGES - 1)
@@ -101,7 +101,7 @@ typedef struct {
     observer_trigger_t trigger; /* since the caller last set it to OBSERVER_TRIGGER_NONE */
 } observer_bandwidth_t;
 
-/* Limits of the coming sample, besides those of the parameters. All zero at the start. */
+/* Limits of the coming sample, besides the limits of the parameters. All zero at the start. */
 typedef struct {
     uint32_t threshold_mean;    /* four times the mean innovation, 2^-32 rev */
     uint32_t holdoff_ticks;     /* minimum time to the next trigger, periods */

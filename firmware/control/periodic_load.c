@@ -56,7 +56,7 @@ static periodic_load_mode_t next_mode(const periodic_load_parameters_t *paramete
         return PERIODIC_LOAD_CLEAR;
     }
     if (load->mode == PERIODIC_LOAD_CLEAR) {
-        return PERIODIC_LOAD_KEEP; /* the estimate before may be that of another run */
+        return PERIODIC_LOAD_KEEP; /* the estimate before may be from another run */
     }
     if (load->moved && load->residual_q8 >= parameters->threshold_q8 && load->change_q8 < load->residual_q8 / 2) {
         return PERIODIC_LOAD_LEARN;
@@ -64,7 +64,7 @@ static periodic_load_mode_t next_mode(const periodic_load_parameters_t *paramete
     return load->load_q8 < load->residual_q8 ? PERIODIC_LOAD_FORGET : PERIODIC_LOAD_KEEP;
 }
 
-/* In the step after that of the last value: neither takes the time of both. */
+/* In the step after the last value's: neither takes the time of both. */
 static void end_turn(const periodic_load_parameters_t *parameters, periodic_load_t *load) {
     load->mode = (uint8_t)next_mode(parameters, load);
     load->engaged = load->mode == PERIODIC_LOAD_LEARN || (load->engaged && load->mode != PERIODIC_LOAD_CLEAR);

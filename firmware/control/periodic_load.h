@@ -1,4 +1,4 @@
-/* Periodic load: a load torque that repeats with every turn of the rotor, as that of a piston compressor, learned over
+/* Periodic load: a load torque that repeats with every turn of the rotor, as a piston compressor's does, learned over
  * the rotor angle.
  *
  * The load observer follows a moving load with the delay of its bandwidth. A load that depends on the angle is known

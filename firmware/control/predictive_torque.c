@@ -128,7 +128,7 @@ NOINLINE static void replan_torque(const machine_tables_t *tables, plan_t *p, in
 
 /* Corrects one phase by the torque shortfall (signed) where it can change in that direction; returns the rest. Of the
  * half that carries the reference: a shortfall goes to the phase that entered last, of motoring phases after them to
- * one before its turn-on where the window is that of torque sharing, an excess is taken from the one that entered
+ * one before its turn-on where the window is torque sharing's, an excess is taken from the one that entered
  * first. Without such a phase an opposed one may reduce its torque. */
 static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *plan, bool positive, bool reverse,
                                      int32_t current_limit_q9, int32_t shortfall) {
@@ -136,7 +136,7 @@ static inline int32_t correct_torque(const machine_tables_t *tables, plan_t *pla
     const int8_t sign = positive ? 1 : -1;
     const int32_t limit = increase ? 1 : -1;
     /* In forward rotation a phase enters the positive half at turn-on, the other half at turn-off. The order of entry
-     * is that of since_on or the reverse; phases before turn-on are last, or, in the reverse order, none. */
+     * is the order of since_on or the reverse; phases before turn-on are last, or, in the reverse order, none. */
     const uint32_t reversal = ((positive != reverse) == increase) ? 0 : HALF_REV - 1;
     plan_t *corrected = NULL;
     plan_t *opposed = NULL;
@@ -258,7 +258,7 @@ static inline int32_t duty_of(const plan_t *p, duty_divisor_t by, unsigned flux_
 }
 
 /* Column in which the next plan begins: the current changes as from the last plan to this one. Within 2 (40 + 4) + 4
- * columns of either sign, and limited to those of the tables where it is used. */
+ * columns of either sign, and limited to the columns of the tables where it is used. */
 static inline void extrapolate_column(predictive_torque_t *control, unsigned phase, const plan_t *p) {
     const int32_t position_q13 = p->flux > 0 ? p->column * (1 << 13) + p->v_q13 + PHASE_CELL_HALF_Q13 : START_Q13;
     control->column[phase] = (int8_t)((2 * position_q13 - control->position_q13[phase]) >> 13);
@@ -303,7 +303,7 @@ void predictive_torque_step(const predictive_torque_parameters_t *parameters, pr
 
     plan_t plan[HAL_PHASES_MAX];
     const unsigned turn = control->turn & 1u;
-    phase_cell_t *cells = control->cell[turn]; /* those of this sample have served */
+    phase_cell_t *cells = control->cell[turn]; /* the cells of this sample have served */
     control->turn = turn ^ 1u;
     int32_t shortfall = torque_q24 >> torque_shift;
     bool reached = true;

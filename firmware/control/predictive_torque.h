@@ -16,7 +16,7 @@
  * phase that entered last and can make more torque, an excess is taken from the one that entered first and can make
  * less. This correction is free to change to another cell, so that a load step is answered within the period. Measured
  * (tools/salient compare dip --quick): three corrections, each in a cell of its own, give the same speed drop.
- * Switch states are those of DITC: every duty alternates between +1 and 0 or between -1 and 0.
+ * Switch states are as in DITC: every duty alternates between +1 and 0 or between -1 and 0.
  *
  * Two periods later the cell of the plan also gives torque and flux linkage from the measured current
  * (predictive_torque_estimate), at the predicted angle.
@@ -33,7 +33,7 @@
  * reserve. A load step then only needs the removal of flux linkage, which -Vdc does immediately at any position. The
  * cost is continuous copper loss.
  *
- * The conduction angles are those of torque sharing, or above base speed of single pulse operation (conduction.h):
+ * The conduction angles come from torque sharing, or above base speed from single pulse operation (conduction.h):
  * flux linkage is then built up before the phase enters the half of the wanted torque, at full voltage and up to the
  * current limit. What a phase produces there counts as torque shortfall, and nothing of it is corrected there.
  */

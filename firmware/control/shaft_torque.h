@@ -1,4 +1,4 @@
-/* Torque of a free shaft by its acceleration: the factor by which the torque differs from that of the tables, from
+/* Torque of a free shaft by its acceleration: the factor by which the torque differs from the tables', from
  * changes of the torque in torque mode, which follow no load.
  *
  * inertia.h has the variance of the torque T and its covariance with A = J0 dw/dt, both less their means over some
@@ -12,7 +12,7 @@
  *
  *   m = q / (g s') = J0 / (J g)
  *
- * is the factor that is missing, when the inertia is known. It is taken for that of the sensors from 1/80, which the
+ * is the factor that is missing, when the inertia is known. It is taken for the sensors' from 1/80, which the
  * sums are right to, up to 1/12 from 1; what differs more is another inertia, and the factor is 1. Derived here. On a
  * dynamometer, which holds the speed, there is no acceleration, and the gain is not observable. */
 #ifndef CONTROL_SHAFT_TORQUE_H

@@ -48,7 +48,7 @@ static int32_t product_q31(int32_t a_q31, int32_t b_q31) {
     return 2 * fixed_multiply_high(a_q31, b_q31);
 }
 
-/* With x = 1 - q: l1 = 1 - (1 - x)^3, and l2 = x (2 - x), l3 = x relative to those of x = 1 at 4 ms. */
+/* With x = 1 - q: l1 = 1 - (1 - x)^3, and l2 = x (2 - x), l3 = x relative to the gains of x = 1 at 4 ms. */
 static void set_narrow(const slow_counts_parameters_t *parameters, uint32_t periods, load_observer_gains_t *gains) {
     const int32_t x_q31 = (int32_t)(periods * parameters->step_q31);
     const int32_t q_q31 = INT32_MAX - x_q31;

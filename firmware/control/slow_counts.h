@@ -1,7 +1,7 @@
 /* Slow counts: correction of the load observer while an encoder of up to 12 bits counts less often than twice in a
  * millisecond. From 13 bits on a load step moves the rotor by a count so soon that the bandwidth's own law is better:
  * at standstill by a tenth to a third of the dip. They remain slow until one comes within 3/8 ms: where it is now one
- * law and now the other, the mean speed is that of neither.
+ * law and now the other, the mean speed is neither's.
  *
  * Most samples then tell only that the rotor is within a count. Its middle, which is right for counts that pass within
  * a few periods, would draw speed and load towards a rotor at rest, and let them swing with each count. Instead:
@@ -14,7 +14,7 @@
  *   left it                  arrives there; l2, l3 of an edge now, but neither closer than 4 ms nor later than the
  *                            estimated speed takes for a count
  *
- * The gains are those of load_observer.h for edges a time t apart, with q = 1 - t / 4 ms, from 4 ms on q = 0, with
+ * The gains are as in load_observer.h for edges a time t apart, with q = 1 - t / 4 ms, from 4 ms on q = 0, with
  * which three edges determine the estimate; l3 is half of that: a load that changed since the last edge has had less
  * time than t. Found by trial with 8 to 14 bits at 5 to 600 r/min. A prediction that is late has the gains of its own
  * time, not of 4 ms, because it contradicts the estimate by no more than its lateness: answered by gains of a

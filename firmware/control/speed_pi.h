@@ -24,7 +24,7 @@ typedef struct {
 /* Integral 0. */
 void speed_pi_reset(speed_pi_t *pi);
 
-/* Integral so that the next torque, without a speed error, is that of another law: N m, Q7.24, within the limits. */
+/* Integral so that the next torque, without a speed error, is another law's: N m, Q7.24, within the limits. */
 void speed_pi_follow(speed_pi_t *pi, int32_t torque_q24);
 
 /* One sample: torque reference in N m, Q7.24, clamped to the limits, from the speed error in rad/s, Q9.22, any value.

@@ -21,7 +21,7 @@ stroke_mean_parameters_t stroke_mean_configure(unsigned phases, uint32_t update_
     return (stroke_mean_parameters_t){.phases = phases, .settle_updates = update_rate_hz * SETTLE_MS / 1000u};
 }
 
-/* Part by which the mean that is compared with follows that of a stroke: time constant twice the settling time. */
+/* Part by which the mean that is compared with follows the mean of a stroke: time constant twice the settling time. */
 static int32_t following_q16(const stroke_mean_parameters_t *parameters, uint32_t updates) {
     const uint32_t since_last = updates * parameters->phases; /* of the phase, below 2^18 */
     const uint32_t settle = parameters->settle_updates;
@@ -37,7 +37,7 @@ static void await_settling(const stroke_mean_parameters_t *parameters, stroke_me
     mean->remaining = fixed_max_u32(strokes, parameters->settle_updates);
 }
 
-/* The sums are those of Q7.24 numbers: in units of 2^8 they fit in 32 bits for 2^8 updates, of 2^16 for 2^16. */
+/* The sums add Q7.24 numbers: in units of 2^8 they fit in 32 bits for 2^8 updates, of 2^16 for 2^16. */
 static unsigned sum_shift(uint32_t updates) {
     return updates < 256 ? 8 : 16;
 }

@@ -1,11 +1,11 @@
 /* Mean load over a stroke, and whether it is constant.
  *
  * What a wrong table adds to the load estimate repeats with every stroke and has the same mean in each; a load that
- * changes has not. The mean of each stroke is compared with that of the same phase's first stroke of the present load:
+ * changes has not. The mean of each stroke is compared with the same phase's in the first stroke of the present load:
  * phases whose misalignments differ have different means, and successive strokes at a high speed differ by little even
  * while the load changes quickly. That mean is followed slowly, by half in 0.2 s, because learning a misalignment moves
  * it, by a quarter of the torque in a second. A phase that has not been seen since a change may instead have the mean
- * of the stroke after which the load counts as changed: the misalignment of the encoder is that of all phases, and at
+ * of the stroke after which the load counts as changed: the misalignment of the encoder is common to all phases, and at
  * 10 r/min each takes a second to come.
  *
  * A load that moves with nearly the frequency of the strokes, or faster, has the same mean in each. Below 53 strokes a
@@ -13,11 +13,11 @@
  *
  *   h = (mean of the first half - mean of the second half) / 2,   d = mean |load - mean that is compared with|
  *
- * The h of a misalignment repeats with each stroke of its phase, and learning takes it towards 0; that of a load has
- * any size and sign. So the load has changed also when h is larger than that of the same phase's last stroke, or than
+ * The h of a misalignment repeats with each stroke of its phase, and learning takes it towards 0; the h of a load has
+ * any size and sign. So the load has changed also when h is larger than in the same phase's last stroke, or than
  * half of it in the other direction. A load with several periods in a stroke has hardly any h, but d. A misalignment
  * has both: of 4 degrees, d is about 1.5 |h|. So the load has changed also when d is more than 2 |h|. Tolerances: half
- * of that of the mean for h, 5/4 of it for d. */
+ * of the mean's for h, 5/4 of it for d. */
 #ifndef CONTROL_STROKE_MEAN_H
 #define CONTROL_STROKE_MEAN_H
 

@@ -1,4 +1,4 @@
-/* Scale of the machine's tables: the factor by which the torque of the machine differs from that of its tables, learned
+/* Scale of the machine's tables: the factor by which the torque of the machine differs from its tables', learned
  * from the energy of each conduction interval of a phase, whatever the tables err by.
  *
  * Between two zeros of its current a phase converts
@@ -16,7 +16,7 @@
  * s and R - R0 follow from sums over the last sixteen intervals of all phases: (1) weighted by the charge, over the
  * samples at the end of the interval, the smaller their flux linkage the more; (2) by the sign of W_t. Errors of the
  * voltage that a current has, as drops which the machine file does not state, count as resistance. Derived here; the
- * energy balance is that of J. M. Stephenson, J. Corda, "Computation of torque and current in doubly salient reluctance
+ * energy balance is from J. M. Stephenson, J. Corda, "Computation of torque and current in doubly salient reluctance
  * motors from nonlinear magnetization data", Proc. IEE 126(5), 1979.
  *
  * s is exact for tables that err by a factor; for tables that err in their shape, or at an angle that is wrong, it is
@@ -85,8 +85,8 @@ typedef struct {
     bool lost;              /* control periods were lost since the last sample */
 } table_scale_sample_t;
 
-/* Factors for the interrupt: with voltages and resistances over s the flux linkages of predictive_torque.h are those of
- * the tables. */
+/* Factors for the interrupt: with voltages and resistances over s the flux linkages of predictive_torque.h are the
+ * tables'. */
 typedef struct {
     int32_t excess_q31;              /* s - 1, Q0.31 */
     int32_t inverse_excess_q31;      /* 1 / s - 1, Q0.31 */

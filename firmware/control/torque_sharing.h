@@ -8,9 +8,9 @@
  * degree with zero slope at both ends, so that the flux linkage which it demands has a limited rate of change; a step
  * of the share would demand an unlimited voltage.
  *
- * Angles are those of a phase with positive torque: 2^31 unaligned .. 2^32 aligned, in 2^-32 electrical rev. A phase in
- * the other half, where its torque is negative, is evaluated at the mirrored angle. The windows are those of the
- * machine over torque and speed, or constant ones that are advanced to earlier angles when the voltage is limited
+ * Angles are for a phase with positive torque: 2^31 unaligned .. 2^32 aligned, in 2^-32 electrical rev. A phase in
+ * the other half, where its torque is negative, is evaluated at the mirrored angle. The windows are the
+ * machine's over torque and speed, or constant ones that are advanced to earlier angles when the voltage is limited
  * (conduction.h). A turn-on angle below 2^31 is then possible, and the share is not zero at the unaligned position.
  */
 #ifndef CONTROL_TORQUE_SHARING_H

@@ -42,7 +42,7 @@ static inline int32_t arm_smmlar(int32_t sum, int32_t a, int32_t b) {
     return result;
 }
 
-/* Upper half of `high`, and that of `low` below it. */
+/* Upper half of `high`, and the upper half of `low` below it. */
 static inline uint32_t arm_pkhtb(int32_t high, int32_t low) {
     uint32_t packed;
     __asm__("pkhtb %0, %1, %2, asr #16" : "=r"(packed) : "r"(high), "r"(low));

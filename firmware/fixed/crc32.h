@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-/* CRC of `count` bytes that follow those with the CRC `crc`; 0: none precede. That of "123456789" is 0xCBF43926. */
+/* CRC of `count` bytes that follow those with the CRC `crc`; 0: none precede. For "123456789" it is 0xCBF43926. */
 uint32_t crc32_continue(uint32_t crc, const void *bytes, unsigned count);
 
 #endif

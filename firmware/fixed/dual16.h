@@ -11,7 +11,7 @@ static inline uint32_t dual16_pack(int32_t low, int32_t high) {
     return ((uint32_t)low & 0xFFFFu) | (uint32_t)high << 16;
 }
 
-/* Upper halves of two words: that of `low` in bits 0..15, that of `high` in bits 16..31. */
+/* Upper halves of two words: the half of `low` in bits 0..15, the half of `high` in bits 16..31. */
 static inline uint32_t dual16_pack_upper(int32_t low, int32_t high) {
 #ifdef __ARM_FEATURE_DSP
     return arm_pkhtb(high, low);

@@ -62,8 +62,8 @@ static inline int64_t fixed_clamp_64(int64_t value, int64_t low, int64_t high) {
     return value < low ? low : value;
 }
 
-/* Right shift that brings a magnitude below 2^bits, bits 1..63. Of a negative number, as a sum of squares that has
- * changed in memory may be, it is that of the largest ones. */
+/* Right shift that brings a magnitude below 2^bits, bits 1..63. For a negative number, as a sum of squares that has
+ * changed in memory may be, it is the shift of the largest ones. */
 static inline unsigned fixed_shift_below(uint64_t magnitude, unsigned bits) {
     const uint64_t above = magnitude >> bits;
     return above != 0 ? 64u - (unsigned)__builtin_clzll(above) : 0;

@@ -153,7 +153,7 @@ static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
 
 /* Fastest parting that a rotor can cause whose motion the encoder does not show, per control period, Wb, Q2.29: its
  * back-EMF a sixteenth of the DC-link voltage, above which a rotor that turned before is found by its travel
- * (monitors/protection.h), or that of a free rotor from rest after 32 degrees. What parts faster is a fault of the
+ * (monitors/protection.h), or a free rotor's from rest after 32 degrees. What parts faster is a fault of the
  * phase.
  */
 static int32_t fastest_parting_q29(const common_t *common) {

@@ -38,7 +38,7 @@ typedef struct {
 
 typedef struct {
     uint32_t lost;  /* bit of the lost phase; 0: none */
-    unsigned angle; /* angles summed up, up to DEGRADED_ANGLES: the torques are then those of all */
+    unsigned angle; /* angles summed up, up to DEGRADED_ANGLES: the torques are then of all */
     int64_t sum_q24;
     int32_t least_q24, most_q24; /* N m, Q7.24 */
     int32_t mean_q24;            /* N m, Q7.24; 0 before the sum is complete */

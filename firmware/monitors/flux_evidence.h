@@ -16,7 +16,7 @@ typedef struct {
     uint32_t excess_still;
     uint32_t excess_by_tables; /* there is one only because the tables have emptied the integral */
     /* By the mean ratio of each phase (phase_balance.h): */
-    uint32_t unbalanced; /* other than those of all other phases */
+    uint32_t unbalanced; /* other than the ratios of all other phases */
     bool all_small;      /* of all phases below what tolerances explain */
     /* By the encoder's angle (angle_evidence.h, encoder_monitor.h): */
     bool parted;            /* flux linkage and tables, while the encoder stays at one count */

@@ -21,7 +21,7 @@
 /* Time without a zero of the current after which drift may be most of the integral, ms. */
 #define RECENT_MS 10u
 
-/* True of a phase that conducts above the currents whose errors are those of the converter, for so short a time that a
+/* True of a phase that conducts above the currents whose errors are the converter's, for so short a time that a
  * warm winding and the error of the voltage are less than half of the flux linkage. */
 static bool counts(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
     const uint32_t recent = RECENT_MS * residual->sample.periods_per_ms;

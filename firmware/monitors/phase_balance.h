@@ -1,14 +1,14 @@
-/* Balance of the phases: the flux linkage that the voltage alone has built up over that of the tables at the measured
+/* Balance of the phases: the flux linkage that the voltage alone has built up over the tables' at the measured
  * current and angle (control/flux_residual.h), as the mean of each phase while it conducts in eight electrical
  * revolutions.
  *
  * What the machine, the DC link and all sensors have in common changes this ratio in all phases alike. So the ratio of
- * one phase to that of the others shows an error of its current sensor which is within the tolerances of a single
+ * one phase to the others' shows an error of its current sensor which is within the tolerances of a single
  * sample (monitors/phase_evidence.h), and a ratio that is small in all of them an encoder that is ahead of the rotor:
  * drops of the devices and a warm winding make it larger only, and what a cold one makes it smaller is added. Where
  * drift may be most of the integral the ratio shows nothing: such samples do not count.
  *
- *   unbalanced  the ratio of a phase is more than 4/3 of those of all others, or less than 3/4
+ *   unbalanced  the ratio of a phase is more than 4/3 of all others', or less than 3/4
  *   all_small   the ratio of every phase is below a limit, twice in succession
  *
  * Revolutions that last longer than 100 ms do not count, nor those in which a phase has hardly conducted, unless it is

@@ -1,4 +1,4 @@
-/* Plausibility of the phase currents: flux linkage psi that the voltage has built up against that of the tables at the
+/* Plausibility of the phase currents: flux linkage psi that the voltage has built up against the tables' at the
  * measured current and angle (control/flux_residual.h).
  *
  *   too_little        psi above the tables' at 1.1 i + offset, at any angle, in two samples
@@ -13,10 +13,10 @@
  *   missing           voltage without current, or a current that has ended within the last 2 ms before the voltage had
  *                     removed it
  *
- * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical, and those of
- * flux_residual.h. At a current of up to 4/128 of its range, a small one, too_little counts only what more than this
+ * Tolerances: current 10 % and 1/128 of its range, flux linkage 15 %, angle 10 degrees electrical, and the ones
+ * in flux_residual.h. At a current of up to 4/128 of its range, a small one, too_little counts only what more than this
  * tolerance of voltage and resistance has built up since the current was larger. An error of the angle explains any psi
- * between those of the unaligned and of the aligned position.
+ * between the unaligned and the aligned position's.
  *
  * What a phase without current cannot tell apart: an open winding, an open switch, the gate supply, a dead sensor. What
  * shows nothing at all: a negative offset in a phase that stands without current, because the converter reads 0; an

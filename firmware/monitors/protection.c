@@ -93,7 +93,7 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
     protection->encoder_angle = input->encoder_angle;
     const uint32_t overruns = count_overruns(protection, input->missed_interrupts);
     uint32_t failed = 0;
-    /* This order takes four instructions less than that of the faults: a single bit, moved, initialises the mask. */
+    /* This order takes four instructions less than the faults' order: a single bit, moved, initialises the mask. */
     fail_if(&failed, (input->break_causes & HAL_PWM_BREAK_OVER_CURRENT) != 0, FAULT_HARDWARE_OVER_CURRENT);
     fail_if(&failed, (input->break_causes & (HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2)) != 0, FAULT_STO);
     fail_if(&failed, input->current_max_q9 > parameters->current_trip_q9, FAULT_OVER_CURRENT);

@@ -10,7 +10,7 @@
  * is below THERMAL_DERATE again.
  *
  * The background samples the currents. Its calls are not synchronous with the commutation, and many in a stroke, so
- * that the mean of their squares is without bias; those of a step of 1 ms or more count alike. The models start cold.
+ * that the mean of their squares is without bias; samples of a step of 1 ms or more count alike. The models start cold.
  */
 #ifndef MONITORS_THERMAL_H
 #define MONITORS_THERMAL_H
@@ -32,7 +32,7 @@
 /* Time constant of the switches against their heat sink. */
 #define THERMAL_SWITCH_TIME_CONSTANT_S 1
 
-/* Squares above this many times that of the continuous current count as this. */
+/* Squares above this many times the square of the continuous current count as this. */
 #define THERMAL_SQUARE_MAX 64
 
 /* One model. */

@@ -1,4 +1,4 @@
-/* Record of a fault. The faults and their numbers are those of drive.dbc. */
+/* Record of a fault. The faults and their numbers come from drive.dbc. */
 #ifndef STORAGE_FAULT_H
 #define STORAGE_FAULT_H
 

@@ -13,7 +13,7 @@
  * but does not have the checksum is damaged. A commit word that was torn is as good as a whole one, because the
  * checksum before it was complete.
  *
- * Wear: one erasure for each page of records instead of one for each record. At 10,000 erasures of a page, those of an
+ * Wear: one erasure for each page of records instead of one for each record. At 10,000 erasures of a page, as on an
  * STM32G4, 20,000 pages of records.
  *
  * Functions that write carry out one operation of the memory at most. All are called in the background.

@@ -62,7 +62,7 @@ typedef struct {
     uint32_t identity;         /* of parameter list and machine tables */
     nvm_store_saving_t saving; /* of the parameters */
     uint32_t saving_revision;  /* parameters.revision that the record has */
-    bool loaded;               /* the parameters at start were those of the memory */
+    bool loaded;               /* the parameters at start came from the memory */
     bool rejected;             /* at start no set could be used */
     bool inhibited;            /* parameter_memory: none could, and none was stored since */
     bool start_written;

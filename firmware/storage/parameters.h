@@ -1,7 +1,7 @@
 /* The drive's parameters, addressed by index over CAN; parameters.def is their table.
  *
- * A value is a raw 32-bit integer; its LSB is 2^-fraction_bits of its unit. Fraction bits and defaults are those of the
- * machine (machine_tables): parameters.def has them for a machine whose units are the SI units.
+ * A value is a raw 32-bit integer; its LSB is 2^-fraction_bits of its unit. Fraction bits and defaults are the
+ * machine's (machine_tables): parameters.def has them for a machine whose units are the SI units.
  */
 #ifndef STORAGE_PARAMETERS_H
 #define STORAGE_PARAMETERS_H
@@ -57,7 +57,7 @@ void parameters_set_controller(parameters_t *parameters, int32_t controller);
 /* Sets the control rate of this drive's board, Hz. */
 void parameters_set_control_rate(parameters_t *parameters, uint32_t control_rate_hz);
 
-/* The default of this drive: that of the machine, but for the controller. index 0..PARAMETER_COUNT-1. */
+/* The default of this drive: the machine's, but for the controller. index 0..PARAMETER_COUNT-1. */
 int32_t parameters_default(const parameters_t *parameters, unsigned index);
 
 /* Values that a set of parameters is checked against. */
@@ -103,7 +103,7 @@ void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_C
 /* As parameters_apply; false, with nothing changed, when a value is out of range. */
 bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
 
-/* CRC-32 of names, units and limits: differs from that of another list. */
+/* CRC-32 of names, units and limits: differs from another list's. */
 uint32_t parameters_identity(void);
 
 #endif
