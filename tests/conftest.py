@@ -34,7 +34,7 @@ sys.path.append(str(ROOT / "tests" / "plant"))
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--turn", type=int, choices=range(TURNS), metavar=f"0..{TURNS - 1}",
-                     help="of the tests that are marked in_turns, those of this turn only; default: all of them")
+                     help="of the tests that are marked in_turns, only this turn's; default: all of them")
     parser.addini("cache_dir", "cache of pytest", default=str(BUILD / "pytest_cache"))  # as all that is made here
 
 

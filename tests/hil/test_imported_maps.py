@@ -1,9 +1,9 @@
 """Torque ripple of drives whose tables are of an imported map, on the motor that the table was taken of: at half the
-rated torque, slow and at base speed, at most 1.2 times that of the drive with a map of the right values at the same
-points.
+rated torque, slow and at base speed, at most 1.2 times the ripple of the drive with a map of the right values at the
+same points.
 
 The table has the motor's flux linkages with another origin, as three phases that differ, or with halves that differ.
-Its points are not those of the motor's own map: how coarse they are costs ripple with the right values, too.
+Its points are not the ones of the motor's own map: how coarse they are costs ripple with the right values, too.
 """
 
 from __future__ import annotations

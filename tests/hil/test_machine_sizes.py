@@ -107,7 +107,7 @@ def test_machine_at_the_end_of_the_range_starts_and_holds_speed_under_load(make_
     parameters = bench.drive.parameters
     parameters_read = {row.name: parameters[row.name] for row in parameters.rows.values()}
     defaults = {row.name: row.default for row in parameters.rows.values()}
-    assert parameters_read == defaults | {"telemetry_period_ms": 1.0}, "that of a bench"
+    assert parameters_read == defaults | {"telemetry_period_ms": 1.0}, "the period of a bench"
 
 
 def test_control_rate_too_low_for_the_highest_speed_of_the_file_is_refused_with_that_reason(make_bench):

@@ -1,4 +1,4 @@
-"""The closed-loop drive of a machine defined by a map compared with that of the sampled formula: 20 x 20 points of the
+"""The closed-loop drive of a machine defined by a map compared with the sampled formula's: 20 x 20 points of the
 saturating machine, the paper's controller. Firmware tables and emulator are both generated from the map.
 
 A single load step depends on the last bits (limit cycles of encoder and duty quantisation), so dip and ripple are

@@ -25,7 +25,7 @@ def modes(bench, duration_s=0.05):
 
 
 def mean_torque_Nm(bench, duration_s=0.15):
-    """Mean of samples in every millisecond: those of pulses are not spread evenly over them."""
+    """Mean of samples in every millisecond: samples of pulses are not spread evenly over them."""
     return bench.truth["torque_Nm"].between(bench.time_s - duration_s, bench.time_s).value.mean()
 
 

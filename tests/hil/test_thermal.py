@@ -43,7 +43,7 @@ def test_rated_torque_below_base_speed_is_continuous(make_bench, machine, contro
 @pytest.mark.parametrize("hot", ["winding", "switch"])
 def test_torque_falls_before_the_trip_and_settles_between_90_and_100_percent(make_bench, controller, hot):
     """A held shaft: one or two phases carry the current of the rated torque all the time, the square of which is above
-    1.2 times that of the continuous current."""
+    1.2 times the square of the continuous current."""
     bench = make_bench(controller=controller)
     bench.drive.parameters["winding_time_constant_s"] = 1
     cool = {"winding": "switch", "switch": "winding"}[hot]

@@ -94,7 +94,7 @@ def test_slew_rate_of_the_reference(make_bench):
 # --- the voltage ----------------------------------------------------------------------------------------------------
 
 def voltage_bound_s(torque_Nm, angle_deg):
-    """Time in which the supply drives the flux linkage of a phase at standstill to that of a torque: the integral of
+    """Time in which the supply drives the flux linkage of a phase at standstill to a torque's: the integral of
     d psi / (V - R i)."""
     magnetics, angle_rad = MACHINE.magnetics, math.radians(angle_deg)
     needed_A = brentq(lambda i: float(magnetics.torque_Nm(angle_rad, i)) - torque_Nm, 0.01, 80)

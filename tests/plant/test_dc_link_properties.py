@@ -2,7 +2,7 @@
 
 Random cases are compared with an independent integration (link_reference.py). The capacitor takes rated current for
 between 5 us and 5 ms per 1 % of the supply voltage, the source drops between 0.2 % and 20 %, and the supply sags and
-comes back. Deviations as in test_plant_properties.py, that of the DC-link voltage relative to the supply voltage.
+comes back. Deviations as in test_plant_properties.py, the DC-link voltage's relative to the supply voltage.
 
 Every case is drawn from (seed, number) alone: SALIENT_PLANT_SEED gives another seed, SALIENT_PLANT_CASES more cases,
 and a failure names the case.

@@ -166,7 +166,7 @@ def spice_waveforms(folder: Path, netlist: list[str]) -> Waveforms:
 
 
 def deviation(measured: Waveforms, expected: Waveforms) -> dict[str, float]:
-    """Largest deviation of each quantity from that of ngspice over the whole run, relative to its largest magnitude."""
+    """Largest deviation of each quantity from ngspice's over the whole run, relative to its largest magnitude."""
     worst = {}
     for name in ("current_A", "flux_linkage_Wb"):
         values = getattr(expected, name)

@@ -4,7 +4,7 @@
  * configures, commands and takes a snapshot, with one number in all members that it writes; the control interrupt
  * writes one number into all members that a snapshot reads, and another into the input of a deferred step, which writes
  * one number into its results. Members that differ were torn, as was an input that changes while its step lasts.
- * drive.c, the exchange with the deferred step, the critical section and the interrupts are those of the drive.
+ * drive.c, the exchange with the deferred step, the critical section and the interrupts are the drive's.
  *
  * With instruction timing, the timer triggers the control interrupt at any instruction. Without, the deferred step
  * requests it at random places.

@@ -70,7 +70,7 @@ def test_equal_runs_write_equal_pages(scenario, tmp_path):
 
 @pytest.mark.in_turns
 def test_motor_of_another_file_is_that_of_pil_and_of_the_host(scenario, tmp_path):
-    """The image has the firmware's tables only; the plant is that of the pair, bit for bit as on the host."""
+    """The image has the firmware's tables only; the plant is the pair's, bit for bit as on the host."""
     scenario.write_text(SCENARIO.replace('"traditional", ', "") + "[record]\nstep_us = 10.0\n")
     heavy = tmp_path / "heavy.toml"
     heavy.write_text(machine_path("saturating").read_text().replace("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.04"))

@@ -3,7 +3,7 @@
     build/venv/bin/python tests/tools/fresh_clones.py [COMMAND ...] [--turn] [--out DIR]
 
 The suite builds everything before it tests a command, and does not see that a command forgets to build what it runs.
-The command lines are those of the documents, so that a new one is run as well. Clones have the commit that is checked
+The command lines come from the documents, so that a new one is run as well. Clones have the commit that is checked
 out and share nothing but Debian's packages and pip's downloads. An interrupted run goes on where it was: a command that
 has passed at this commit is not repeated. The clone of one that failed stays in the folder of --out, with its output.
 """

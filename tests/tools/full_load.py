@@ -32,7 +32,7 @@ _LOOK_FRAMES = 65_536
 
 
 def frames(duration_s: float) -> Iterator[VirtualMessage]:
-    """Frames that follow each other without a gap: those of the nodes when they are due, else others. Each has its
+    """Frames that follow each other without a gap: the nodes' when they are due, else others. Each has its
     number in its first bytes."""
     rates = BitRates(BIT_RATE)
     lengths = {(m.frame_id, m.is_extended_frame): m.length for each in databases() for m in each.messages}

@@ -3,7 +3,7 @@
     build/venv/bin/python tests/tools/kills.py [--only KIND ...] [--instants 20] [--seed 1] [--out build/kills]
 
 A command is first run undisturbed. An instant is a random share of the duration that this run had; a command that runs
-until it is interrupted has twice the time to its first line. The signal goes to the process or, as that of a terminal,
+until it is interrupted has twice the time to its first line. The signal goes to the process or, as a terminal's,
 to its group. After it nothing may be left: no process, recognised by a variable of its environment or by the folder of
 its temporary files in its command line, no temporary file, no socket, no lock, nothing half-written in the build
 folder; and no traceback. The next start must end as the undisturbed run did; of a command of more than LONG_S it must

@@ -50,7 +50,7 @@ def content(message: can.Message) -> list[object]:
 
 
 def frames(classic: bool = False) -> Iterator[tuple[int, can.Message]]:
-    """Frames of every kind, 1.001 ms apart. classic: without those of flexible data rate."""
+    """Frames of every kind, 1.001 ms apart. classic: without frames of flexible data rate."""
     for number in range(FRAMES):
         kind = number % 6
         yield START_NS + number * 1_001_000, can.Message(
@@ -148,8 +148,8 @@ ORIGINALS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "mf4_mixed": (".mf4", lambda: _mf4_mixed()[0]),
     "mf4_compressed": (".mf4", lambda: _mf4_of(Layout(block_bytes=600, compression=1))[0]),
 }
-"""Format: suffix and an intact log. Those of blf_objects are mutated before they are compressed; the second of MF4 is
-that of a logger whose power was cut."""
+"""Format: suffix and an intact log. The objects of blf_objects are mutated before they are compressed; the second of
+MF4 is the log of a logger whose power was cut."""
 
 
 @lru_cache

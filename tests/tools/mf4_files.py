@@ -53,7 +53,7 @@ class _File:
 
 
 def bus_logging(frames: Sequence[tuple[int, can.Message]], layout: Layout) -> tuple[bytes, list[int]]:
-    """A file, and for each frame the place after its last byte; that of a compressed one means nothing. Times are whole
+    """A file, and for each frame the place after its last byte; a compressed one's means nothing. Times are whole
     ticks of 100 ns after START_NS."""
     file = _File(layout.is_finished)
     header = file.add(b"##HD", [0] * 6, struct.pack("<QhhBBBBdd", START_NS, 0, 0, 0, 0, 0, 0, 0.0, 0.0))

@@ -60,7 +60,7 @@ BO_ 311 LIMITS: 8 BMS
 {CLASSES}BA_ "GenMsgCycleTime" BO_ 310 20;
 BA_ "GenMsgCycleTime" BO_ 311 50;
 """
-"""Its STATUS is another one than that of the first file."""
+"""Its STATUS is another one than the first file's."""
 CYCLES_MS = {(300, False): 10, (301, False): 100, (2566844926 & 0x1FFFFFFF, True): 25, (310, False): 20,
              (311, False): 50}
 NODES = {"ABS": [(300, False), (301, False)], "ESP": [(2566844926 & 0x1FFFFFFF, True)],

@@ -16,7 +16,7 @@ CHALLENGE = 0x12345678
 
 class DriveOfTelemetry:
     """A session in which a drive answers a request to arm after `answer_ms` of its time, and confirms likewise; its
-    time passes `slowness` times as slowly as that of the session. None: it never answers."""
+    time passes `slowness` times as slowly as the session's. None: it never answers."""
 
     def __init__(self, answer_ms: int | None, slowness: int = 1, switched_on_ms: int = 0) -> None:
         self.drive_database = drive_database()

@@ -117,7 +117,7 @@ def test_instruction_counts_of_the_plant_are_reproducible(pattern: SwitchingPatt
 
 
 def test_instruction_counts_of_the_drive_are_reproducible_except_for_the_client() -> None:
-    """The bundling of a client's frames in the socket, those of the arming among them, depends on the load of the
+    """The bundling of a client's frames in the socket, the arming's among them, depends on the load of the
     computer: up to 0.6 % of the whole was seen in this short span."""
     first, second = (callgrind.of_drive("paper", 0.01) for _ in range(2))
     assert first["plant"] == second["plant"] and first["control laws"] == second["control laws"]

@@ -1,5 +1,5 @@
 """The CAN pages, docs/can, computed from its own text: checksums by the parameters that it states, bytes
-by the layouts that it states, names and numbers as those of drive.dbc; and its frames, as the drive takes them."""
+by the layouts that it states, names and numbers as in drive.dbc; and its frames, as the drive takes them."""
 
 from __future__ import annotations
 

@@ -299,7 +299,7 @@ def test_sine_is_judged_by_the_swing_of_the_free_shaft():
 
 
 def held(torque_Nm, current_A, request_Nm, speed_rpm=2250.0, **bench):
-    """Metrics of a held shaft of linear_cosine, and those of a part of the torque."""
+    """Metrics of a held shaft of linear_cosine, and metrics of a part of the torque."""
     scenario = Scenario(name="", machine="linear_cosine", duration_s=0.1, torque=(TorqueStep(0.0, request_Nm),),
                         bench={"held_speed_rpm": speed_rpm, **bench})
     recording = recording_of(torque_Nm=torque_Nm, current_a_A=current_A, current_b_A=current_A)

@@ -185,7 +185,7 @@ def test_drop_is_that_of_the_motor_whatever_the_file_says(tmp_path):
 
 
 def test_motor_makes_the_torque_that_the_file_leaves_out(tmp_path):
-    """The file's torque is 0.8 times the motor's at every angle and current; the current is that of the file."""
+    """The file's torque is 0.8 times the motor's at every angle and current; the current is the file's."""
     cases = [case for case in GROUPS["mismatch"].cases(True)
              if case.extractor == "mismatch_held" and case.controller in {"paper", "salient"}]
     runs = run_all(cases, 2, io.StringIO(), tmp_path)

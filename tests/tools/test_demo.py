@@ -198,7 +198,7 @@ def test_other_machines_are_within_the_same_bounds(machine, settles_s, tmp_path)
     assert f"\n{point['step_rpm']:g} r/min, load step of {point['load_Nm']:g} N m at " in stream.getvalue()
     start, step = results["experiments"]["start_600"]["paper"], results["experiments"]["load_step_150"]
     assert settles_s[0] < start["settling_time_s"] <= settles_s[1]
-    # The reaching law of the finite-element machine, steep for salient, is that of the paper's controller, too.
+    # The reaching law of the finite-element machine, steep for salient, is the paper's controller's, too.
     assert 0.0 <= start["overshoot_percent"] <= (1.0 if machine == "finite_element" else 0.5)
     assert 0.0 < step["paper"]["recovery_time_s"] <= 0.010
     assert 0.005 < step["paper"]["torque_ripple"] < 0.25 * step["traditional"]["torque_ripple"]

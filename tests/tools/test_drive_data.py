@@ -78,7 +78,7 @@ def test_every_value_is_finite_and_in_order(path):
                                                                          data.current_peak_A)
     assert data.speed_base_rpm <= data.speed_max_rpm < data.over_speed_rpm
     assert data.under_voltage_V < data.supply_min_V <= data.supply_max_V < data.over_voltage_V
-    # The voltage makes the rated torque at the base speed, and the bound of a start is not below that of the torque.
+    # The voltage makes the rated torque at the base speed, and the bound of a start is not below the torque's.
     source = Source(data.supply_min_V, machine.resistance_ohm)
     pulses = single_pulse(replace(machine, supply_voltage_V=data.supply_min_V), data)
     base_rad_s = data.speed_base_rpm * math.pi / 30.0

@@ -256,7 +256,7 @@ def test_flux_linkage_beyond_its_format_is_rejected_in_one_line(name):
 
 
 class BetweenRows(Scaled):
-    """Flux linkage with a maximum half way between rows: those of the saturating machine are equidistant."""
+    """Flux linkage with a maximum half way between rows: the rows of the saturating machine are equidistant."""
 
     def flux_linkage_Wb(self, angle_rad, current_A):
         row = (np.asarray(angle_rad) - HALF_RAD) / HALF_RAD * (ROWS - 1)

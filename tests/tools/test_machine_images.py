@@ -51,7 +51,7 @@ NESTED = ("machine_format_t", "magnetics_t", "converter_t", "dc_link_t", "sensor
 
 
 def members_of(structure: str) -> list[str]:
-    """Names of the members in the C headers, those of nested structures with both names."""
+    """Names of the members in the C headers, members of nested structures with both names."""
     headers = ("firmware/control/machine_tables.h", "emulator/plant/machine.h", "emulator/plant/magnetics.h",
                "emulator/plant/flux_map.h")
     text = "".join((ROOT / name).read_text(encoding="utf-8") for name in headers)

@@ -1,6 +1,6 @@
 """Documented commands work as written.
 
-In docs/, every README.md and CONTRIBUTING.md, the fenced blocks marked `sh` are run, those of a section in order and
+In docs/, every README.md and CONTRIBUTING.md, the fenced blocks marked `sh` are run, a section's in order and
 in the root of the repository. A block that starts `tools/salient sim` keeps running until the end of its section, as it
 would in a second terminal. Blocks marked `sh untested` are not run: a debugger, builds and measurements of minutes, the
 tests themselves. Commands that select tests of this suite list them only: the suite runs them. Buses get a path in the

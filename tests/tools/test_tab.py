@@ -1,4 +1,4 @@
-"""The drive in a browser tab: one file, its client against that of the tools, rewinding, links. In Node; in a browser:
+"""The drive in a browser tab: one file, its client against the tools', rewinding, links. In Node; in a browser:
 test_tab_browser.py."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Execution of many runs: once for each key, resumable, in shards, whatever is killed. The functions are those of the
-standard library where a worker has to import them."""
+"""Execution of many runs: once for each key, resumable, in shards, whatever is killed. The functions are the
+standard library's where a worker has to import them."""
 
 from __future__ import annotations
 

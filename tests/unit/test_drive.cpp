@@ -1440,7 +1440,7 @@ TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
     }
 }
 
-// The control parameters are always those of the whole set, though a run takes over parts of them only.
+// The control parameters always belong to the whole set, though a run takes over parts of them only.
 TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     periods(100);
     command(COMMAND_RUN);

@@ -1,4 +1,4 @@
-// The salient controller on the emulated machine: its metrics next to those of its reference model, and properties that
+// The salient controller on the emulated machine: its metrics next to its reference model's, and properties that
 // need no reference. One program per bundled machine; `ctest -V` shows the table.
 #include <algorithm>
 #include <cmath>
@@ -29,7 +29,7 @@ void compare(const std::string &metric, double fixed, double model, double relat
     EXPECT_NEAR(fixed, model, std::max(relative * model, absolute)) << metric;
 }
 
-// 6 mN m of 8 N m and friction. The reference model has no tables; those of the firmware have errors of 4 to 9 mN m
+// 6 mN m of 8 N m and friction. The reference model has no tables; the firmware's have errors of 4 to 9 mN m
 // (test_control_phase_map), more than a tenth of the small ripple with two pulses: measured up to 4 mN m, 8 %, with the
 // tables of the finite-element machine; 2 % or less with two pulses and the tables of the others.
 constexpr double TABLES_RIPPLE = 6e-3 / 8.3;
@@ -147,7 +147,7 @@ TEST(SalientClosedLoop,
     edges.edges = true;
     ideal.encoder_bits = 32;
     ideal.adc_bits = 16;
-    // Where in a count the load comes is chance: more angles make both medians those of the machine.
+    // Where in a count the load comes is chance: more angles make both medians the machine's.
     const struct {
         const char *name;
         setup_t setup;

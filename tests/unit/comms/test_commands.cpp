@@ -42,7 +42,7 @@ class Commands : public testing::Test {
 
     void supervise(drive_state_t state, uint32_t time_us) { commands_supervise(&commands, state, time_us, TIMEOUT_US); }
 
-    // Time of the background's last round is that of the frame.
+    // Time of the background's last round is the frame's.
     commands_frame_t take(const hal_can_frame_t &frame, drive_state_t state, uint32_t time_us) {
         supervise(state, time_us);
         return receive(frame, time_us);
@@ -302,7 +302,7 @@ TEST_F(Commands, a_run_is_off_until_the_drive_is_armed_and_then_takes_effect_at_
     EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_RUN);
     EXPECT_EQ(receive(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~0x12345678u), 3000), COMMANDS_COMMAND);
     EXPECT_EQ(command.request, COMMAND_RUN);
-    EXPECT_EQ(command.time_us, 1000u) << "the age is that of the command";
+    EXPECT_EQ(command.time_us, 1000u) << "the age is the command's";
     EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE);
     EXPECT_EQ(commands.arming.challenge, 0u);
     EXPECT_EQ(receive(command_frame(2), 4000), COMMANDS_COMMAND);

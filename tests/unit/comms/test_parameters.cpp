@@ -19,7 +19,7 @@ struct Texts {
     std::string name, unit;
 };
 
-// By index; those of the drive are one text.
+// By index; the drive's are one text.
 const Texts TEXTS[PARAMETER_COUNT] = {
 #define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text) {name, unit},
 #include "storage/parameters.def"
@@ -102,7 +102,7 @@ TEST_F(Parameters, limits_are_allowed_and_one_beyond_is_rejected) {
         for (const int64_t value :
              {int64_t(row->minimum), int64_t(row->maximum), int64_t(row->minimum) - 1, int64_t(row->maximum) + 1}) {
             if (value != int32_t(value)) {
-                continue; // the limit is that of the 32 bits
+                continue; // the limit is the limit of the 32 bits
             }
             parameters_t set = parameters;
             set.values[i] = int32_t(value);

@@ -29,7 +29,7 @@ bp_pid_parameters_t parameters_of(bp_pid_mode_t mode) {
     return parameters;
 }
 
-// A PID with its tuner, of which each step follows that of the PID, as in the drive.
+// A PID with its tuner, of which each step follows the step of the PID, as in the drive.
 struct tuned_pid_t {
     explicit tuned_pid_t(const bp_pid_parameters_t &of) : parameters(of) {
         bp_pid_reset(&pid);

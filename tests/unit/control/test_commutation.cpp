@@ -132,7 +132,7 @@ TEST(Commutation, where_windows_overlap_the_last_to_enter_is_active_and_its_pred
 }
 
 TEST(Commutation, all_phases_of_a_machine_are_treated_equally) {
-    // A third (a quarter) of an electrical revolution later, the roles are those of the next phase.
+    // A third (a quarter) of an electrical revolution later, the roles are the next phase's.
     std::mt19937 random(2);
     for (int i = 0; i < 200000; i++) {
         const commutation_angles_t p = {uint32_t(random()), uint32_t(random()), uint32_t(random())};

@@ -493,7 +493,7 @@ TEST_F(Conduction, stays_in_range_for_any_sample_and_any_tables) {
 }
 
 // In whole numbers, by the roundings that conduction_step() states. After a reset and without a shortfall the level is
-// that of the torque alone.
+// the level of the torque alone.
 class ConductionRounding : public Conduction {
   protected:
     static constexpr wide_integer::wide_t ONE_Q15 = 32768;

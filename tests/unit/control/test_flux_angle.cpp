@@ -1,5 +1,5 @@
-// Misalignment by flux linkage, on strokes of a machine whose flux linkage, resistance and voltage are not those of the
-// tables.
+// Misalignment by flux linkage, on strokes of a machine whose flux linkage, resistance and voltage are not the
+// tables'.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

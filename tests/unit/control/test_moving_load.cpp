@@ -107,7 +107,7 @@ TEST(MovingLoad, a_trend_withholds_four_more_stages_each_time_constant_up_to_all
     Detector detector;
     while (detector.step(COUNT / 4) == 0) {
     }
-    EXPECT_EQ(detector.state.withheld, 1 + WIDENING) << "besides that of a beat";
+    EXPECT_EQ(detector.state.withheld, 1 + WIDENING) << "besides the beat's";
     uint32_t periods = 1;
     while (detector.step(COUNT / 4) == 1 + WIDENING) {
         periods++;

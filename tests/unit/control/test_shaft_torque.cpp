@@ -22,7 +22,7 @@ class ShaftTorque : public testing::Test {
   protected:
     ShaftTorque() { parameters.variance_min_q14 = LEAST_Q14; }
 
-    // Windows of a torque whose true value is `machine` times that of the tables, and is estimated with a factor.
+    // Windows of a torque whose true value is `machine` times the tables', and is estimated with a factor.
     void windows(int count, double machine, double in_effect, double variance = 20.0, double correlation = 1.0) {
         for (int k = 0; k < count; k++) {
             const double of_tables = variance * (1.0 + 0.3 * std::sin(double(k)));

@@ -1,5 +1,5 @@
 // Scale of the tables and resistance, by conduction intervals of a machine whose flux linkage, resistance and drops are
-// not those of the tables: against the factors that the model has been given, and a double-precision twin of the sums.
+// not the tables': against the factors that the model has been given, and a double-precision twin of the sums.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

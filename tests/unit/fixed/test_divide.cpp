@@ -1,4 +1,4 @@
-// 64-bit division against that of the compiler.
+// 64-bit division against the compiler's.
 #include <cstdint>
 #include <limits>
 #include <random>

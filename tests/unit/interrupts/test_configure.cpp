@@ -202,7 +202,7 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     ASSERT_LE(std::fabs(share.stroke - stroke), 1.0);
     const bool own_windows = v(PARAMETER_SHARE_ON_ANGLE_DEG) < 180.0;
     ASSERT_EQ(c.conduction.own_windows, own_windows);
-    if (own_windows) { // that of the largest torque stands for them
+    if (own_windows) { // the window of the largest torque stands for them
         const machine_sharing_window_t &widest = machine_tables.sharing[0][0][MACHINE_SHARING_PARTS - 1];
         ASSERT_EQ(share.turn_on - (1u << 31), uint32_t(widest.on) << 16);
         ASSERT_EQ(share.turn_off - (1u << 31), uint32_t(widest.off) << 16);

@@ -344,7 +344,7 @@ TEST_F(Deferred, a_run_in_torque_mode_begins_without_torque_whatever_the_load) {
     }
     state.observer.load_torque_q24 = 8 << 24;
     ASSERT_TRUE(torque_period(3.0));
-    EXPECT_EQ(state.torque_reference_q24, 0) << "the results in effect are those of the time before the run";
+    EXPECT_EQ(state.torque_reference_q24, 0) << "the results in effect are from the time before the run";
     ASSERT_GT(state.observer.load_torque_q24, 7 << 24);
     torque_period(3.0);
     EXPECT_EQ(state.torque_reference_q24, 1 << 20) << "slew rate from zero";
@@ -707,7 +707,7 @@ TEST_F(Deferred, a_trigger_in_a_skipped_period_lengthens_the_holdoff) {
     ASSERT_LT(state.bandwidth.stage, OBSERVER_BANDWIDTH_STEADY_STAGE);
     EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000);
     deferred_step(&parameters, &state, &command);
-    EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000) << "the input is that of the period before";
+    EXPECT_EQ(results().bandwidth.holdoff_ticks, RATE_HZ / 1000) << "the input is from the period before";
     period(COMMAND_OFF);
     EXPECT_NEAR(results().bandwidth.holdoff_ticks, RATE_HZ / 1000.0 * 1.25, 1.0);
 }

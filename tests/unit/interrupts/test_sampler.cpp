@@ -169,7 +169,7 @@ class Course {
         EXPECT_EQ(part_.of(memory_[setup_.variable.word]), value_);
     }
 
-    // Records that precede an event are those of earlier events.
+    // Records that precede an event belong to earlier events.
     void expect_trigger(int64_t event) {
         if (trigger_record_ < 0 &&
             (event >= trigger_now_ || holds(setup_.condition, value_, level_, has_last_ ? &last_ : nullptr))) {

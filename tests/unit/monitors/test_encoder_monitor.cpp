@@ -195,7 +195,7 @@ TEST_F(EncoderMonitor,
         speed_deg_s = -speed_deg_s;
         EXPECT_NEAR(run(RATE_HZ), RATE_HZ / 4, 1) << turn;
     }
-    // The number of the period comes round: that of the last turn round, with the direction before it, is a new one.
+    // The number of the period comes round: the last turn's, with the direction before it, is a new one.
     speed_deg_s = 0.0;
     EXPECT_EQ(run(RATE_HZ / 100), 0u);
     input.periods = monitor.reversed_at - RATE_HZ / 1000;

@@ -180,7 +180,7 @@ TEST_F(FluxMonitorState, phases_with_evidence_of_a_fault_are_those_of_this_run_o
     EXPECT_EQ(monitor.phases, 0u);
 }
 
-// Phases with evidence of a fault, when a sample has that of one phase and a current that others have or lack.
+// Phases with evidence of a fault, when a sample has evidence of one phase and a current that others have or lack.
 class FluxMonitorPhases : public FluxMonitorState {
   protected:
     struct Evidence {

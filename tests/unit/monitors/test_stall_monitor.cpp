@@ -80,7 +80,7 @@ TEST_F(Stall, rotor_that_reverses_while_it_accelerates_is_not_stalled_and_one_th
     EXPECT_NEAR(time_to_fault_us(380000, [&](uint32_t us) { reverses(us, 150000); }), 250000, 3000);
 }
 
-// As by a stop that is withdrawn: the speed would be that of both directions.
+// As by a stop that is withdrawn: the speed would belong to both directions.
 TEST_F(Stall, reversing_rotor_whose_reference_is_0_for_some_milliseconds_is_not_stalled) {
     for (const int direction : {1, -1}) {
         input.torque_reference_q24 = direction * 19 * NM;
@@ -133,7 +133,7 @@ TEST_F(Stall,
 }
 
 // A reversal, or the start of a rotor that turns backwards, of a large inertia: half a stroke before it stands, and
-// after it, takes longer than a swing may. The ripple is that of the observer, 0.1 rad/s at 300 Hz.
+// after it, takes longer than a swing may. The ripple is the observer's, 0.1 rad/s at 300 Hz.
 TEST_F(Stall, rotor_that_comes_to_its_reference_from_the_other_side_is_not_stalled_however_slowly) {
     for (const int direction : {1, -1}) {
         input.speed_reference_q22 = direction * 30 * RAD_S;

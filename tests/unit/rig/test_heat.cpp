@@ -55,7 +55,7 @@ TEST_F(Heat, AWindingHasTheHeatOfItsLossesLessWhatItGaveAway) {
     const double kept_J = rise_K * data().winding_capacity_J_K;
     EXPECT_GT(loss_J, 1.0);
     EXPECT_LT(kept_J, loss_J);
-    // Given away: at most that of the last temperature all the time, at least none.
+    // Given away: at most as at the last temperature all the time, at least none.
     EXPECT_GT(kept_J, loss_J - rise_K / data().winding_resistance_K_W * 0.5);
     EXPECT_NEAR(heat_winding_C(&bench.rig->heat), 25.0 + rise_K, 1e-12);
     EXPECT_NEAR(heat().winding.temperature_C[2], 25.0, 1e-3);

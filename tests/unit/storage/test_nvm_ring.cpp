@@ -48,7 +48,7 @@ class NvmRing : public testing::Test {
         return steps;
     }
 
-    // A record is there, and is that of the number.
+    // A record is there, and is the number's.
     bool has(uint32_t sequence, uint64_t number) {
         payload_t payload{};
         return nvm_ring_read(&ring, &hal, sequence, payload.data()) && payload == payload_of(number);
@@ -154,7 +154,7 @@ TEST_F(NvmRing, a_torn_commit_word_is_told_until_the_next_record_is_written) {
     write(2);
     EXPECT_FALSE(ring.torn_commit);
     start();
-    EXPECT_FALSE(ring.torn_commit) << "that of an older record does not matter";
+    EXPECT_FALSE(ring.torn_commit) << "an older record's does not matter";
 }
 
 TEST_F(NvmRing, a_record_that_is_given_up_is_begun_anew_in_another_place) {

@@ -150,7 +150,7 @@ TEST_F(NvmStore, every_bit_of_the_newest_set_that_flips_makes_the_drive_use_the_
     write(WRITE_SET);
     write(WRITE_SET);
     ASSERT_TRUE(has_set(&drive, 2));
-    // In the commit word a flipped bit has no consequence: the checksum is that of a complete set.
+    // In the commit word a flipped bit has no consequence: the checksum is a complete set's.
     for (unsigned word = 0; word + 1 < SET_WORDS; word++) {
         for (unsigned bit = 0; bit < 64; bit++) {
             *set_word(1, word) ^= UINT64_C(1) << bit;

@@ -2,7 +2,7 @@
  * firmware on the emulated flash.
  *
  * A write is a set of parameters or a fault in the log, with the number of the start that follows it. After each cut
- * the drive starts again, and its parameters must be those before the write or those of the write, all of them; the log
+ * the drive starts again, and its parameters must all be as before the write or all as the write has them; the log
  * must have every fault before the write, as far back as it reaches, and may have the new one; the number of the start
  * must not have decreased. Then the write is repeated, or the next one made, and must succeed.
  */
@@ -135,7 +135,7 @@ static void write_next(started_t *drive, memory_t *memory, write_t write, uint32
     }
 }
 
-/* Whether the parameters are those of a set. */
+/* Whether the parameters are a set's. */
 static bool has_set(const started_t *drive, uint32_t set) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         if (drive->parameters.values[i] != set_value(&drive->parameters, set, i)) {

@@ -1,5 +1,5 @@
 // Reference models: the control laws in double precision, written from their equations, which the tests compare the
-// firmware with. A model has no formats, no rounding and no saturation other than those of the law itself.
+// firmware with. A model has no formats, no rounding and no saturation other than the law's own.
 #ifndef TESTS_UNIT_REFERENCE_MODELS_H
 #define TESTS_UNIT_REFERENCE_MODELS_H
 
@@ -68,7 +68,7 @@ struct observer_t {
         return difference - std::round(difference);
     }
 
-    // speed_unit_rad_s: unit of the speed, and with that of the torque of inertia and friction.
+    // speed_unit_rad_s: unit of the speed, and with it of the torque of inertia and friction.
     static observer_t ideal(double bandwidth_rad_s, double rate_hz, double inertia_kg_m2, double friction_Nm_s,
                             double speed_unit_rad_s = 1.0) {
         const double revolution = 2.0 * PI / speed_unit_rad_s; // speed times seconds
@@ -115,7 +115,7 @@ struct moving_load_t {
     unsigned withheld = 0;
     bool releasing = false;
 
-    // rounding: added to the threshold; kept: stages that the present bandwidth does not reach, 0 in that of a beat.
+    // rounding: added to the threshold; kept: stages that the present bandwidth does not reach, 0 in the beat's.
     unsigned step(double innovation, double rounding, bool triggered, unsigned kept) {
         const double magnitude = time_s < settled_s ? 0.0 : std::fabs(trend);
         time_s += 1.0 / rate_hz;
@@ -147,7 +147,7 @@ struct moving_load_t {
 };
 
 // Bandwidth schedule of the load observer: 5 / t since the last trigger, between steady and transient bandwidth.
-// Angles in revolutions. The thresholds are those of the firmware.
+// Angles in revolutions. The thresholds are the firmware's.
 struct bandwidth_t {
     double steady_rad_s, beat_rad_s, count_trigger_rad_s, edge_trigger_rad_s, rate_hz;
     double threshold_count, threshold_edge;
@@ -484,8 +484,8 @@ struct network_t {
     }
 };
 
-// Incremental PID with the gains of the network, bp_pid.h and bp_tuner.h: those of a step are by the inputs of the step
-// before. `scaled_limit`: largest scaled error.
+// Incremental PID with the gains of the network, bp_pid.h and bp_tuner.h: the gains of a step are by the inputs of the
+// step before. `scaled_limit`: largest scaled error.
 struct bp_pid_t {
     enum mode_t { FIXED = 1, FROZEN = 2, LEARNING = 3 };
     mode_t mode;
