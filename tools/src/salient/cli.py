@@ -247,7 +247,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     wheel = command("wheel", "the Python package with its programs, for suites in other repositories")
     wheel.add_argument("--out", type=Path, default=OUT / "wheel", metavar="DIR",
                        help="folder (default %(default)s)")
-    wheel.add_argument("--tag", metavar="vX.Y.Z", help="tag of a release: must be that of the version")
+    wheel.add_argument("--tag", metavar="vX.Y.Z", help="tag of a release: must be the version's")
 
     docs = command("docs", "the documents as a site, for a browser")
     docs.add_argument("--out", type=Path, default=OUT / "docs", metavar="DIR", help="folder (default %(default)s)")
@@ -339,7 +339,7 @@ def _add_bit_rates(parser: argparse.ArgumentParser) -> None:
                         help=f"of the bus in bit/s, for its load: {option.allowed} (default {DEFAULTS['bit_rate']})")
     parser.add_argument("--data-bit-rate", type=_data_bit_rate, metavar="N",
                         help="of the data of flexible data rate frames that switch it: a whole number from 10000 to "
-                        "20000000 (default that of --bit-rate)")
+                        "20000000 (default: as --bit-rate)")
 
 
 def _add_can(parser: argparse._ActionsContainer) -> None:
@@ -364,10 +364,10 @@ def _add_compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("groups", nargs="*", metavar="GROUP", help="measurements (default all but the long ones)")
     parser.add_argument("--list", action="store_true", help="list the groups")
     parser.add_argument("--machine", metavar="NAME|FILE", help="of one machine only, its speeds fractions of its base "
-                        "speed and its loads of its rated torque, as those of the paper's machine")
+                        "speed and its loads of its rated torque, as with the paper's machine")
     parser.add_argument("--true-machine", type=_option_type("true_machine"), metavar="NAME|FILE",
                         help="with --machine: the machine of the emulated motor, converter and supply instead; speeds, "
-                        "loads, targets and bounds stay those of --machine")
+                        "loads, targets and bounds stay as for --machine")
     parser.add_argument("--quick", action="store_true", help="fewer machines, rates and angles: about 20 s")
     parser.add_argument("--out", type=Path, default=OUT / "compare", metavar="DIR",
                         help="folder (default %(default)s)")
@@ -404,7 +404,7 @@ def _add_sweep_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=_option_type("seed"), metavar="N", help="the first (default as the scenario)")
     parser.add_argument("--out", type=Path, default=OUT / "sweep", metavar="DIR", help="folder (default %(default)s)")
     parser.add_argument("--resume", action="store_true",
-                        help="keep the finished runs in the folder; those of shards are always kept")
+                        help="keep the finished runs in the folder; runs of shards are always kept")
     _add_execution_options(parser)
     parser.add_argument("--shard", type=shard, default=(1, 1), metavar="I/N",
                         help="only the I-th of N parts; keeps the finished runs in the folder")

@@ -165,7 +165,7 @@ class Conditions:
 
     machine: str = _option("saturating", MACHINE, "machine", metavar="NAME|FILE", commands=_CONDITION, argument=False)
     true_machine: str | None = _option(None, MACHINE, "machine of the emulated motor, converter and supply, where it "
-                                       "differs from that of the firmware, its DBC and the tools", metavar="NAME|FILE",
+                                       "differs from the firmware's, its DBC's and the tools'", metavar="NAME|FILE",
                                        commands=("sim", "demo", "run", "pil"), argument=False)
     controller: str = _option("salient", WORD, "controller at the start", metavar="NAME", choices=CONTROLLERS,
                               commands=("sim",))
@@ -188,12 +188,12 @@ class Conditions:
 class BenchConfig(Conditions):
     """A drive and its test bench.
 
-    can: the bus, "auto" until a command or a fixture has chosen one. machine_image: that of `machine` with
+    can: the bus, "auto" until a command or a fixture has chosen one. machine_image: of `machine` with
     the plant of `true_machine`, from the cache unless given. build: a CMake preset, of HOST_BUILDS or
     TARGET_BUILDS or WASM_BUILD. instructions, execution, instruction_ns: in QEMU only, the last on the Cortex-M4 only;
-    instructions gets the instruction count of each control interrupt (uint32, little endian) and a file beside it those
-    of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns None:
-    the firmware takes no simulated time.
+    instructions gets the instruction count of each control interrupt (uint32, little endian) and a file beside it the
+    count of each deferred interrupt (deferred_instructions), execution what salient.target.trace reads. instruction_ns
+    None: the firmware takes no simulated time.
     """
 
     can: str = _option("auto", BUS, "CAN bus", metavar="BUS", commands=("sim",))
@@ -228,7 +228,7 @@ class BenchConfig(Conditions):
     build: str = _option("host", WORD, "processor that runs the firmware: the host, or one that QEMU emulates",
                          metavar="NAME", choices=TARGETS, commands=("sim", "demo", "run"), flag="target",
                          argument=False)
-    program: Path | None = _option(None, FILE, "executable of another project instead of that of the build",
+    program: Path | None = _option(None, FILE, "executable of another project instead of the build's",
                                    argument=False)
     instructions: Path | None = _option(None, FILE, "instruction counts", argument=False)
     execution: Path | None = _option(None, FILE, "execution trace", argument=False)

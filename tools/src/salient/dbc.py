@@ -56,7 +56,7 @@ def drive_dbc_of_phases(text: str, phases: int) -> str:
 
 
 NODE_STEP = 16
-"""From the identifiers and data IDs of a drive to those of the next node number (firmware/comms/node.h)."""
+"""From the identifiers and data IDs of a drive to the next node number's (firmware/comms/node.h)."""
 RIG_NODE_STEP = 0x100
 """Likewise of the test bench (TRANSPORT_NODE_SHIFT of emulator/rig/transport_frame.h)."""
 RIG_OF_ALL = ("RIG_RUN_UNTIL", "RIG_CLOCK", "RIG_STAMP")
@@ -67,7 +67,7 @@ _NODE = re.compile(r'^(CM_ BU_ DRIVE "The drive with node number) 0\b[^"]*', re.
 
 
 def drive_dbc_of_node(text: str, node: int) -> str:
-    """The DBC of a drive with another node number, from that of node 0."""
+    """The DBC of a drive with another node number, from the DBC of node 0."""
     if node == 0:
         return text
     text = _NODE.sub(rf"\g<1> {node}.", text)
@@ -76,7 +76,7 @@ def drive_dbc_of_node(text: str, node: int) -> str:
 
 
 def rig_dbc_of_node(text: str, node: int) -> str:
-    """The DBC of the test bench of a drive with another node number, from that of node 0."""
+    """The DBC of the test bench of a drive with another node number, from the DBC of node 0."""
     shared = {int(number) for number, name in re.findall(r"^BO_ (\d+) (\w+):", text, re.MULTILINE)
               if name in RIG_OF_ALL}
     return _with_identifiers(text, lambda number: number + (0 if number in shared else RIG_NODE_STEP * node))

@@ -111,7 +111,7 @@ def _end(line: str, code: int) -> int:
 
 
 def _output_has_no_reader() -> bool:
-    """Whether standard output is a pipe whose reader has closed it; else the pipe is that of a bus or a child."""
+    """Whether standard output is a pipe whose reader has closed it; else the pipe belongs to a bus or a child."""
     poll = select.poll()
     poll.register(1, 0)
     return any(events & select.POLLERR for _, events in poll.poll(0))

@@ -13,7 +13,7 @@ on where it was interrupted, and commits nothing.
     keeps = { "summary.json" = "tests/campaign/faults.json" }  # files of {out}, and where they are committed
     summary = "tests/campaign/faults.json"                     # JSON or TOML, with `commit`
     table = "study"                                            # optional: tables of it, "*" for each; without: itself
-    where = { controller = "salient" }                         # optional: those of the tables with these values
+    where = { controller = "salient" }                         # optional: only tables with these values
     counts = "finished"                                        # number of tries, as `failed`
     failed = "violations"                                      # a number, a list, or tables with a `count`
     at_most = 0                                                # failures
@@ -200,7 +200,7 @@ def _changes(claim: Claim, commit: str, root: Path) -> str:
 
 
 def run(out: Path, only: Sequence[str], *, rerun: bool) -> int:
-    """Judges the claims, or those of the names, and writes the page; returns 1 when one is red. rerun: runs the
+    """Judges the claims, or only the named ones, and writes the page; returns 1 when one is red. rerun: runs the
     commands of the red ones before. UsageError: an unknown name; RunFailed: a command left no summary."""
     claims = read_claims(ROOT / CLAIMS)
     unknown = sorted(set(only) - {claim.name for claim in claims})

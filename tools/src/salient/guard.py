@@ -83,7 +83,7 @@ def begin() -> bool:
             return False
         folder = None
         try:
-            # Beside those of the runs around it: a path within all of them is too long for sockets.
+            # Beside the folders of the runs around it: a path within all of them is too long for sockets.
             folder = Path(tempfile.mkdtemp(prefix=f"salient-{os.getpid()}-", dir=outside())).absolute()
             _start(pidfd, folder)
         except (OSError, NotImplementedError):
@@ -198,7 +198,7 @@ def _has(folder: bytes, process: Path) -> bool:
 
 
 def _begin_of(pid: int) -> int:
-    """Start of a process in clock ticks since that of the system; -1: it has ended."""
+    """Start of a process in clock ticks since the system's; -1: it has ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_bytes()
     except OSError:

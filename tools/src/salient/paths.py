@@ -89,7 +89,7 @@ def _open_lock() -> TextIO:
 
 def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
     """Makes the folder of --out, if needed; UsageError when nothing can be written there. removed: patterns of the
-    files of an earlier run, which could be taken for those of one that fails half-way."""
+    files of an earlier run, which could be taken for the files of one that fails half-way."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()

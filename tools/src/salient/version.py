@@ -1,4 +1,4 @@
-"""Version of firmware and tools: that of the CMake project. Standard library only."""
+"""Version of firmware and tools, from the CMake project. Standard library only."""
 
 import re
 

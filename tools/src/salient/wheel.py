@@ -17,7 +17,7 @@ from salient.version import VERSION
 
 
 def check_tag(tag: str) -> None:
-    """UsageError when the tag of a release is not that of the version."""
+    """UsageError when the tag of a release is not the version's."""
     if tag != f"v{VERSION}":
         raise UsageError(f"--tag {tag}: must be v{VERSION}, the version in CMakeLists.txt")
 

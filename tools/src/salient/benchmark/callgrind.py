@@ -73,7 +73,7 @@ def _count_drive(options: BenchConfig, loaded_s: float) -> Counts:
 
 
 def _counted(run: Callable[[list[str]], None]) -> Counts:
-    """Calls `run` with the command line of the profiler, which precedes that of the program."""
+    """Calls `run` with the command line of the profiler, which precedes the program's."""
     with tempfile.TemporaryDirectory(prefix="salient-") as folder:
         out = Path(folder) / "callgrind.out"
         try:

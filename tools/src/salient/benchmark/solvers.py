@@ -13,7 +13,7 @@ from salient.reference.scipy_plant import dop853, dopri5, lsoda, run_scipy
 
 REFERENCE_TOLERANCE = 1e-12
 _PLANT_PASSES = 20
-"""Passes of the plant, of one millisecond each; --runs sets those of the reference solvers."""
+"""Passes of the plant, of one millisecond each; --runs sets the passes of the reference solvers."""
 
 PLANT = {"plant": 1.0, "plant, steps of 1/8": 1.0 / 8.0, "plant, steps of 1/32": 1.0 / 32.0}
 """Factors of the step-size limits."""

@@ -178,8 +178,8 @@ def _container(file: LogInput, header: bytes, begin: int) -> tuple[bytes, Damage
 
 
 def _inflated(content: bytes, length: int, begin: int, is_cut: bool) -> tuple[bytes, bool]:
-    """Decompressed objects, not more than their stated length, and whether that was all. Those of a container with a
-    wrong checksum are not known to be right; those before the end of a file are."""
+    """Decompressed objects, not more than their stated length, and whether that was all. Objects of a container with
+    a wrong checksum are not known to be right; objects before the end of a file are."""
     decompressor = zlib.decompressobj()
     try:
         data = decompressor.decompress(content, length + 1)

@@ -94,12 +94,12 @@ class VirtualTimeReader:
 
     @property
     def has_virtual_time(self) -> bool:
-        """False while the times are those of the interface."""
+        """False while the times are the interface's."""
         return self._stamped or not self._on_interface
 
     def receive(self, timeout: float | None) -> tuple[int, can.Message] | None:
         """The next (virtual time in ns, message), or None after `timeout` seconds without one, also while frames come
-        that have no time yet, as those of other nodes where there is no drive. With a timeout of 0 all that have come
+        that have no time yet, as other nodes' where there is no drive. With a timeout of 0 all that have come
         are read."""
         end_s = math.inf
         while True:

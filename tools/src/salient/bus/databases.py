@@ -1,4 +1,4 @@
-"""Databases of the other nodes of a bus: DBC files of their makers, beside those of the drive and its test bench."""
+"""Databases of the other nodes of a bus: DBC files of their makers, beside the drive's and its test bench's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BITS_MAX = 64
 
 
 def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]:
-    """The databases of files, beside those of the drive with a node number and its test bench.
+    """The databases of files, beside the databases of the drive with a node number and its test bench.
 
     A message whose name another one has is named FILE:MESSAGE; its first sender is the node to which it belongs, FILE
     where the file names none (`node_of`). UsageError, a line that begins with the option: a file cannot be read or is
@@ -111,7 +111,7 @@ def _check(path: Path, message: Message) -> None:
 
 
 def _name_messages(database: Database, path: Path, label: str, names: set[str], reserved: Iterable[str]) -> None:
-    """Gives the messages names and nodes that are not those of others. label: of the file."""
+    """Gives the messages names and nodes that no other has. label: of the file."""
     for message in database.messages:
         if message.name in names:
             message.name = f"{label}:{message.name}"

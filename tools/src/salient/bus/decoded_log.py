@@ -16,7 +16,7 @@ from salient.bus.signals import BusSignals, SignalTable, drive_database, rig_dat
 
 class DecodedLog(FileLog):
     """Frames that no database defines are left out: other identifiers and lengths, remote and error frames, and of
-    drive and test bench those of a flexible data rate. others: databases of other nodes (load_databases).
+    drive and test bench all frames of a flexible data rate. others: databases of other nodes (load_databases).
 
     write raises OtherDatabase, as Carrier does: with the first report of another machine than the one that is stated,
     or of an unknown one, and then there is no file; or when the drive becomes another one, and the file ends there.
@@ -71,7 +71,7 @@ class DecodedLog(FileLog):
         self._finish()
 
     def _write_kept(self) -> None:
-        """Writes the frames that are kept, as those of the likely machine."""
+        """Writes the frames that are kept, as frames of the likely machine."""
         raise NotImplementedError
 
     def _finish(self) -> None:

@@ -90,7 +90,7 @@ def classic_bits(message: can.Message) -> int:
 
 
 def flexible_bits(message: can.Message) -> tuple[int, int]:
-    """Bits of a flexible data rate frame at the bit rate of arbitration, and at that of data; without a switch of the
+    """Bits of a flexible data rate frame at the bit rate of arbitration, and at the data's; without a switch of the
     rate the latter are 0."""
     switches = bool(message.bitrate_switch)
     if message.is_extended_id:

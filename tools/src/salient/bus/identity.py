@@ -1,8 +1,8 @@
 """The machine that a drive carries, by the hashes in DRIVE_IDENTITY and DRIVE_MACHINE: every tool that decodes the
-frames of a drive asks `Carrier`, so that none decodes those of one machine with the factors of another.
+frames of a drive asks `Carrier`, so that none decodes frames of one machine with the factors of another.
 
-Candidates, in their order: the machine that a note beside a log names, the default, the bundled ones, those of the
-examples, and every machine that a drive has been started with here (salient.machine.cache keeps their files). Machines
+Candidates, in their order: the machine that a note beside a log names, the default, the bundled ones, the
+examples', and every machine that a drive has been started with here (salient.machine.cache keeps their files). Machines
 with the same DBC are equal to what decodes; the hash of the machine tells them apart. A machine that is not known here
 but has the DBC of one that is, is decoded as that one, and said to be another.
 """
@@ -147,7 +147,7 @@ class Carrier:
             self._tell_apart(drive, reported, self._carried)
 
     def _tell_apart(self, drive: str, reported: int, carried: int) -> None:
-        """Finds the machine among those of the same DBC; one line when it is unknown, or another than stated."""
+        """Finds the machine among the ones with the same DBC; one line when it is unknown, or another than stated."""
         same = _same(reported, carried, self._noted)
         if self._given is None and same is not None:
             self.machine = same

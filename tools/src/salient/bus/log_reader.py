@@ -34,7 +34,7 @@ class NoKnownFrame(RunFailed):
 
 
 class KnownFrames:
-    """Whether the frames of a log are those of a drive or its test bench, with a node number or any (None), or of other
+    """Whether the frames of a log belong to a drive or its test bench, with a node number or any (None), or to other
     nodes, by their databases."""
 
     def __init__(self, node: int | None, others: Sequence[Database] = ()) -> None:
@@ -56,7 +56,7 @@ class KnownFrames:
         key = (message.arbitration_id, message.is_extended_id, len(message.data))
         nodes = nodes_of_messages().get(key, frozenset())
         self.found = bool(nodes) if self._node is None else self._node in nodes
-        if not self.found and len(nodes) == 1:  # the time of the test bench is that of all drives
+        if not self.found and len(nodes) == 1:  # the time of the test bench is common to all drives
             self._others |= nodes
 
     def require(self, where: str, end: str = "") -> None:

@@ -1,6 +1,6 @@
 """Blocks of an MF4 file (ASAM MDF 4): the links between them, texts, and data blocks of any kind as a stream of bytes.
 
-Sizes and links are those of a file that may be damaged: nothing is read twice, followed in a circle, or made of a size
+Sizes and links come from a file that may be damaged: nothing is read twice, followed in a circle, or made of a size
 that the file merely states.
 """
 
@@ -108,7 +108,7 @@ class Blocks:
         return content.partition(b"\0")[0].decode("utf-8", errors="replace")
 
     def data(self, address: int) -> Iterator[bytes]:
-        """The bytes of a data block, or of those of a list. Damage, after what can be read."""
+        """The bytes of a data block, or of the data blocks of a list. Damage, after what can be read."""
         waiting = [address] if address else []
         while waiting:
             address = waiting.pop()

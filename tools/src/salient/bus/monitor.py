@@ -66,7 +66,7 @@ def record(address: str, path: Path, duration_s: float | None, machine: str | No
         raise UsageError(f"--out {path}: {error.strerror}") from None
     log = open_log(path, machine, node, address, rotation, others)
     count, closed = 0, None
-    # The formats with frames have those of all nodes.
+    # The formats with frames have the frames of all nodes.
     nodes = _Nodes(address, node if path.suffix in DECODED_SUFFIXES else None, others)
     try:
         for timed in nodes.watch(_frames(address, duration_s, "recording", nodes)):
@@ -113,7 +113,7 @@ def monitor(options: argparse.Namespace) -> int:
             if line and not heard and carrier.machine is None and not nodes.absent:
                 heard = True
                 print(f"salient: {address}: no DRIVE_IDENTITY within {IDENTITY_WAIT_NS / 1e9:g} s: the signals are "
-                      f"those of {carrier.likely}; --machine states another", file=sys.stderr, flush=True)
+                      f"taken for {carrier.likely}'s; --machine states another", file=sys.stderr, flush=True)
             if line:
                 _write(line)
             due_ns += every_ns
@@ -372,7 +372,7 @@ class _MainSignals:
 
 
 def _exceeding(telemetry: SignalTable) -> str:
-    """The direction in which the load exceeds the torque, which is that of the torque that would hold it; empty when it
+    """The direction in which the load exceeds the torque: the direction of the torque that would hold it; empty when it
     does not."""
     if telemetry["DRIVE_AVAILABLE_TORQUE.load_exceeds"].last_name != "yes":
         return ""

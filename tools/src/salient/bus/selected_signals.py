@@ -78,7 +78,7 @@ def _columns(databases: Sequence[Database], names: Sequence[str]) -> list[_Colum
 
 
 def _resolve(name: str, known: Collection[str]) -> list[str]:
-    """The one of MESSAGE.SIGNAL that a name means, or those of a message."""
+    """The MESSAGE.SIGNAL that a name means, or all of a message."""
     if of_message := [full_name for full_name in known if full_name.partition(".")[0] == name]:
         return of_message
     found = [full_name for full_name in known if name in (full_name, full_name.partition(".")[2])]

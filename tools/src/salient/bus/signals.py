@@ -42,7 +42,7 @@ def rig_database(node: int = 0) -> Database:
 
 
 def near_signals(name: str, known: Iterable[str]) -> str:
-    """close_names of a signal: SIGNAL among the signals, MESSAGE.SIGNAL among those of the message, or all when there
+    """close_names of a signal: SIGNAL among the signals, MESSAGE.SIGNAL among the message's, or all when there
     is no such message. known: names of which those in the form MESSAGE.SIGNAL count."""
     full = [each for each in known if "." in each]
     message, dot, _ = name.partition(".")
@@ -139,8 +139,8 @@ class SignalTable(Mapping[str, Signal]):
             self._width[key] = max(_WORD_BYTES, message.length)
 
     def decode_with(self, database: Database) -> None:
-        """Decodes by another database from here on, what there is already as well: that of another machine, which has
-        the same messages with other factors."""
+        """Decodes by another database from here on, what there is already as well: another machine's, which has the
+        same messages with other factors."""
         self._messages: dict[FrameKey, Message] = {}
         self._names: dict[str, tuple[FrameKey, cantools.database.can.Signal]] = {}
         for message in sorted(database.messages, key=lambda m: m.frame_id):
@@ -153,7 +153,7 @@ class SignalTable(Mapping[str, Signal]):
                 self._names[f"{message.name}.{signal.name}"] = (key, signal)
 
     def add(self, time_ns: int, message: can.Message) -> None:
-        """Adds a frame if the node sends it and its length is that of the DBC."""
+        """Adds a frame if the node sends it and its length is as in the DBC."""
         key = (message.arbitration_id, message.is_extended_id)
         data = message.data
         if self._length.get(key) != len(data) or message.is_remote_frame or message.is_fd or message.is_error_frame:
@@ -237,7 +237,7 @@ class LatestSignals(SignalTable):
 
 class BusSignals(SignalTable):
     """The signals of a database of other nodes: flexible data rate frames count, and frames that are longer than the
-    message, as those of a flexible data rate have to be."""
+    message, as frames of a flexible data rate have to be."""
 
     def add(self, time_ns: int, message: can.Message) -> None:
         key = (message.arbitration_id, message.is_extended_id)

@@ -28,7 +28,7 @@ _REMEMBERED = 4096  # identifiers whose length is known, for a last line without
 
 
 def read_text(file: LogInput, suffix: str) -> Frames:
-    """Time in ns and frame, of the format that the first line shows, else that of the suffix. Damage."""
+    """Time in ns and frame, of the format that the first line shows, else the suffix's. Damage."""
     lines = (line for line in file.lines() if line.text.strip(" \t\0"))
     first = next(lines, None)
     if first is None:
@@ -227,7 +227,7 @@ class _Asc:
         is_fd = not flags or bool(int(flags[0], 16) & 0x1000) or length > 8  # some writers leave the flags at 0
         is_remote = not is_fd and bool(int(flags[0], 16) & 0x10)
         if is_fd and length > dlc2len(code):
-            raise ValueError(f"its code {code} is not that of {length} data bytes")
+            raise ValueError(f"its code {code} does not mean {length} data bytes")
         return can.Message(arbitration_id=identifier, is_extended_id=is_extended, is_rx=words[1].lower() == "rx",
                            is_fd=is_fd, bitrate_switch=is_fd and brs, error_state_indicator=is_fd and esi,
                            is_remote_frame=is_remote, dlc=length if is_fd else code, data=data)
@@ -393,7 +393,7 @@ def _read_csv(lines: Iterator[Line], file: LogInput) -> Frames:
     read = next((reader for columns, reader in ((_SAVVY_COLUMNS, _savvy), (_PYTHON_CAN_COLUMNS, _python_can))
                  if columns <= set(names)), None)
     if read is None:
-        raise header.damage("its columns are those of neither SavvyCAN nor python-can")
+        raise header.damage("its columns are neither SavvyCAN's nor python-can's")
     for line in lines:
         fields = [field.strip() for field in line.text.split(",")]
         try:

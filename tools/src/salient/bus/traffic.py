@@ -39,8 +39,8 @@ _NOT_CYCLIC = ("onchange", "onwrite", "triggered", "event", "spontan")
 @dataclass(frozen=True)
 class Definition:
     """A message as its database defines it. node: the sender. cycle_ns: expected, 0 without one. pauses: its absence is
-    no fault. settable: the cycle is the default of a parameter. is_of_file: of another node than those of drives, and
-    frames may be longer."""
+    no fault. settable: the cycle is the default of a parameter. is_of_file: of another node than a drive's, and frames
+    may be longer."""
 
     node: str
     name: str
@@ -156,11 +156,11 @@ class _Entry:
 
 
 class Traffic:
-    """Takes the frames of a bus in their order. Times are those of the frames; of a bus that is silent `advance` moves
+    """Takes the frames of a bus in their order. Times are the frames'; of a bus that is silent `advance` moves
     them."""
 
     def __init__(self, rates: BitRates, databases: Sequence[Database] = (), node: int = 0) -> None:
-        """databases: of load_databases. node: of the drive; those of the other node numbers are known, too."""
+        """databases: of load_databases. node: of the drive; messages of the other node numbers are known, too."""
         self._rates = rates
         self._known = known_messages(node, databases)
         self._off_bus = _rig_identifiers()
@@ -183,7 +183,7 @@ class Traffic:
     # --- frames ----------------------------------------------------------------------------------------------------
 
     def add(self, time_ns: int, message: can.Message) -> None:
-        """Takes a frame; those of test benches are not on the bus."""
+        """Takes a frame; frames of test benches are not on the bus."""
         key = (message.arbitration_id, message.is_extended_id)
         if key in self._off_bus and not message.is_error_frame:
             self.advance(time_ns)

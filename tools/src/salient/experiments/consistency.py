@@ -10,7 +10,7 @@ from salient.errors import UsageError
 def check_consistency(values: Mapping[str, float], chosen: Mapping[str, float], supply_V: float) -> None:
     """UsageError, in one line that names both, for a contradiction.
 
-    values: all parameters by name, in their units. chosen: those of them that the user has set. supply_V: voltage of
+    values: all parameters by name, in their units. chosen: the ones that the user has set. supply_V: voltage of
     the supply. A trip below the current limit is a contradiction only when the limit is chosen: lowering the trip alone
     is how a trip is tested.
     """

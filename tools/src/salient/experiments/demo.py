@@ -232,7 +232,7 @@ def _by_experiment(runs: Iterable[_Run], attribute: str) -> dict[str, dict[str, 
 
 
 def _conditions(scenarios: Mapping[str, Sequence[Scenario]]) -> dict[str, Any]:
-    """Conditions of the metrics; equal for all runs except the step of the recording, which is that of the ripple."""
+    """Conditions of the metrics; equal for all runs except the step of the recording, which is the ripple's."""
     scenario, start = scenarios["load_step_150"][0], scenarios["start_600"][0]
     assert scenario.record is not None  # as in its file
     data = derive(load_machine(machine_path(scenario.machine)))

@@ -125,10 +125,10 @@ CASES = (
     FaultCase("bit of a constant flipped", "constant_flipped", {"bit": 3064}),
     FaultCase("bit of the state flipped", "state_flipped", {"bit": 0}),
     FaultCase("bit of the program flipped", "code_flipped", {"byte": 0},
-              unsupported="the program of the host is not that of the drive alone; tests/hil/test_self_test.py flips "
-                          "it on the Cortex-M4 and RV32"),
+              unsupported="the program of the host is not the drive's alone; tests/hil/test_self_test.py flips it on "
+                          "the Cortex-M4 and RV32"),
     FaultCase("guard word of the stack changed", "stack_guard_flipped", {"bit": 0},
-              unsupported="the stack of the host is that of its operating system; as the program"),
+              unsupported="the stack of the host belongs to its operating system; as the program"),
     FaultCase("bit of the timer's period flipped", "period_register_flipped", {"bit": 3}),
     FaultCase("clock 6 % off", "clock_drift", {"drift_percent": 6.0}),
 )
@@ -162,7 +162,7 @@ def measure(case: FaultCase, machine: str, controller: str) -> Reaction:
     detected_s = None
     if len(cause):
         latched_s = result.telemetry["DRIVE_FAULT_CAUSE.time_us"].value[0].item() * 1e-6
-        # A reset by the watchdog sets the drive's clock back: the time is that of its first report.
+        # A reset by the watchdog sets the drive's clock back: the time is the time of its first report.
         detected_s = max(0.0, (latched_s if latched_s > since_s - _BEFORE_S else cause.time_s[0].item()) - since_s)
     first = cause.between(-np.inf, cause.time_s[0] + 1e-9).last_name if len(cause) else "none"
     until_s = scenario.duration_s if detected_s is None else since_s + detected_s

@@ -22,8 +22,8 @@ class Cluster:
 
 @contextmanager
 def cluster(folder: Path, environment: Mapping[str, str] | None = None) -> Generator[Cluster, None, None]:
-    """A Dask scheduler and two workers of one thread on the loopback. environment: variables besides those of this
-    process. They end with the context."""
+    """A Dask scheduler and two workers of one thread on the loopback. environment: variables besides this
+    process's. They end with the context."""
     processes: list[subprocess.Popen[str]] = []
 
     def start(module: str, *options: str) -> subprocess.Popen[str]:

@@ -44,7 +44,7 @@ BAND = 0.005
 RIPPLE_WINDOW_S = (0.3, 0.4)
 RIPPLE_STEP_MAX_S = 1e-6
 SPECTRUM_TO_HZ = 2000.0
-# The spectrum is that of means over this time, a multiple of the period at every control rate, which removes the
+# The spectrum is of means over this time, a multiple of the period at every control rate, which removes the
 # switching.
 SPECTRUM_STEP_S = 100e-6
 _WINDOW_BINS = 3  # a line's width under a Hann window, to either side

@@ -2,7 +2,7 @@
 
     python -m salient.experiments.mutants [--file PART ...] [--per-file N] [--seed S] [--out DIR] [--list]
 
-The operators are those of DeMillo, Lipton and Sayward ("Hints on test data selection", IEEE Computer 11(4), 1978) as
+The operators are from DeMillo, Lipton and Sayward ("Hints on test data selection", IEEE Computer 11(4), 1978) as
 far as C of this kind has a use for them (OPERATORS). Of the places in a file a sample is drawn by the seed, so that
 another seed judges others; without --per-file all. A mutant is compiled and linked as a planted bug is (planted.py),
 and judged by the unit tests of its module, by those that include its header, and by tests/unit/test_drive.cpp:
@@ -46,7 +46,7 @@ from salient.progress import Progress, steps_of
 KNOWN = ROOT / "tests" / "mutants.toml"
 SUMMARY = ROOT / "tests" / "mutants.json"
 TEST_MAX_S = 60
-"""Processor time of a program of tests, several times that of the slowest one."""
+"""Processor time of a program of tests, several times the slowest one's."""
 KILLED, EQUIVALENT, INVALID, SURVIVED = "killed", "equivalent", "invalid", "survived"
 _WHOLE_DRIVE = "test_drive"
 
@@ -116,7 +116,7 @@ def _changes(line: str) -> Iterator[tuple[int, str, str]]:
 
 
 def mutants(file: str) -> list[Mutant]:
-    """All of a source, in its order. Names are those of the changes, with a number where a line repeats itself."""
+    """All of a source, in its order. Names are the changes', with a number where a line repeats itself."""
     text = (ROOT / file).read_text(encoding="utf-8")
     offset, found, names = 0, [], Counter[str]()
     for line in _code(text).split("\n"):
@@ -248,7 +248,7 @@ def main() -> int:
     options = parser.parse_args()
     files = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "firmware").rglob("*.c"))]
     named = [file for file in files if any(part in file for part in options.file)]
-    planted.build_unchanged([])  # the programs that judge are those of the build folder
+    planted.build_unchanged([])  # the programs that judge are in the build folder
     chosen = drawn(named, options.per_file, options.seed)
     if not chosen:
         raise UsageError(f"--file {' '.join(options.file)}: no source of firmware/ has this in its path")

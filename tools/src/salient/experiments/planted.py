@@ -70,7 +70,7 @@ class Bug:
 
     @property
     def label(self) -> str:
-        """Its name in that of a folder."""
+        """Its name in the name of a folder."""
         return re.sub(r"\W+", "_", self.name)
 
     def finders(self, kind: str) -> tuple[str, ...]:

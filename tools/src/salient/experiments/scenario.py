@@ -4,7 +4,7 @@
     controllers = ["traditional", "paper"]  # one run each
     duration_s = 0.4
     load_profile = "compressor_one_cylinder"  # optional: torque over the rotor angle, tools/loads or path of a CSV file
-    true_machine = "mine.toml"              # optional: the emulated machine, where it is not that of the firmware
+    true_machine = "mine.toml"              # optional: the emulated machine, where it is not the firmware's
     seed = 1                                # optional, as everything below; other fields of
     control_rate_hz = 40000                 # salient.config.Conditions likewise, also in [drive] of the machine file
 
@@ -404,7 +404,7 @@ class _RecordTable(Table):
 
 @lru_cache
 def _scenario_file() -> type[Table]:
-    """The model of a file; the ranges of [bench] are those of rig.dbc."""
+    """The model of a file; the ranges of [bench] are from rig.dbc."""
     variables: dict[str, Any] = {name: (Annotated[float, number(*variable_range(name))], None)
                                  for name in bench_variables()}
     bench = create_model("bench", __base__=Table, **variables)
@@ -483,7 +483,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
 
 
 def with_true_machine(scenarios: list[Scenario], true_machine: str | None) -> list[Scenario]:
-    """The scenarios of one file with another machine in the emulator, None for that of the file. UsageError: the two do
+    """The scenarios of one file with another machine in the emulator, None for the file's. UsageError: the two do
     not fit."""
     if true_machine is None:
         return scenarios

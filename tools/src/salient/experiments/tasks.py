@@ -84,7 +84,7 @@ def file_digest(file: Path) -> str:
 
 
 def check_build(present: str, wanted: str) -> None:
-    """RunFailed on a worker whose programs have another digest than those of the computer that hands out the tasks."""
+    """RunFailed on a worker whose programs have another digest than on the computer that hands out the tasks."""
     if present != wanted:
         raise RunFailed("a worker has another build of the drive than this computer; install the same on all")
 

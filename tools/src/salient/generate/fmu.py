@@ -69,7 +69,7 @@ class Variable:
 
 
 def variables(machine: Machine) -> list[Variable]:
-    """Inputs, outputs and parameters of a unit of this machine. Limits are those of the plant, wider than a machine
+    """Inputs, outputs and parameters of a unit of this machine. Limits are the plant's, wider than a machine
     file's: the firmware's number formats do not matter here."""
     phases = [(phase, PHASES[phase]) for phase in range(machine.phases)]
     return [

@@ -1,6 +1,6 @@
 """The cyclic messages of a node in C: a structure of all their signals, a function that packs it, and the schedule.
 
-The schedule is that of the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
+The schedule comes from the database: GenMsgCycleTime and GenMsgStartDelayTime in ms; GenMsgSendType cyclicIfActive
 marks messages that are sent only while their cause lasts; the enumeration TelemetryGroup names the messages that are
 queued together; PhasesAbove those that only a machine of more phases sends; TelemetryRate those whose period can be
 set, GenMsgCycleTime being its default.

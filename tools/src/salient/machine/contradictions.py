@@ -40,7 +40,7 @@ NOISE_MAX = 0.03
 FLUX_DENSITY_T = (0.05, 3.0)
 """Range for saturated poles; steel saturates at 1.5 to 2.4 T, ferrite at 0.4."""
 TIME_CONSTANT_MAX = 2.0
-"""The drive's time constant of the winding, in those of the winding's heat path."""
+"""The drive's time constant of the winding, in time constants of the winding's heat path."""
 AMBIENT_C, LIMITED_BELOW_K = 25.0, 20.0
 """As AMBIENT_C of emulator/rig/heat.c; the torque is limited from LIMITED_BELOW_K below a limit of temperature on."""
 FIELDS_MAX = 30.0
@@ -357,7 +357,8 @@ _RULES_OF_HEAT = (
          "winding.resistance_ohm", least=True),
     Rule("winding_time_constant_s",
          lambda of: TIME_CONSTANT_MAX * of["thermal.winding_capacity_J_K"] * of["thermal.winding_resistance_K_W"],
-         f"{TIME_CONSTANT_MAX:g} times that of {{thermal/winding_resistance_K_W}} and", "thermal.winding_capacity_J_K",
+         f"{TIME_CONSTANT_MAX:g} times the time constant of {{thermal/winding_resistance_K_W}} and",
+         "thermal.winding_capacity_J_K",
          when=lambda of: "thermal.winding_resistance_K_W" in of),
     Rule("iron_loss.turns_area_m2", lambda of: _flux_Wb(of) / FLUX_DENSITY_T[1],
          f"or {FLUX_DENSITY_T[1]:g} T are in the iron at {{current_peak_A}} by", lambda of: of.flux_key, least=True),

@@ -29,7 +29,7 @@ class Machine:
     converter: dict[str, float]
     """Every key of Converter but supply_voltage_V."""
     dc_link: dict[str, float] | None
-    """Keys of DcLink, those of the chopper only when there is one; None: ideal."""
+    """Keys of DcLink, the chopper's only when there is one; None: ideal."""
     sensors: dict[str, float]
     """Every key of Sensors."""
     iron_loss: dict[str, float] | None

@@ -143,10 +143,10 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
     minimum_V = data.add("supply_min_V", "V", min(supply_V, data.given.get("supply_max_V", supply_V)),
                          "converter.supply_voltage_V")
     maximum_V = data.add("supply_max_V", "V", max(supply_V, minimum_V), "converter.supply_voltage_V")
-    rate_hz = data.add("control_rate_hz", "Hz", DEFAULTS["control_rate_hz"], "that of the board", DEFAULT)
-    data.add("encoder_bits", "", DEFAULTS["encoder_bits"], "that of the board; 0 ideal", DEFAULT)
-    data.add("encoder_edges", "", DEFAULTS["encoder_edges"], "that of the board", DEFAULT)
-    data.add("adc_bits", "", DEFAULTS["adc_bits"], "that of the board", DEFAULT)
+    rate_hz = data.add("control_rate_hz", "Hz", DEFAULTS["control_rate_hz"], "the board's", DEFAULT)
+    data.add("encoder_bits", "", DEFAULTS["encoder_bits"], "the board's; 0 ideal", DEFAULT)
+    data.add("encoder_edges", "", DEFAULTS["encoder_edges"], "the board's", DEFAULT)
+    data.add("adc_bits", "", DEFAULTS["adc_bits"], "the board's", DEFAULT)
 
     peak_A = data.add("current_peak_A", "A", *_peak_current(machine, data.given))
     peak_Nm = data.add("torque_peak_Nm", "N m",
@@ -171,7 +171,7 @@ def _derive_ratings(machine: Machine, data: _Values) -> None:
              "half a pole pitch less a stroke: (supply_min_V - R I) * angle / psi; at most speed_max_rpm")
     data.add("speed_max_rpm", "r/min", min(2.0 * data.values["speed_base_rpm"], sampled_rpm),
              f"2 * speed_base_rpm, with at least {SAMPLES_PER_TURN_MIN} control periods in an electrical revolution")
-    data.add("thermal_time_constant_s", "s", 60.0, "that of a winding without forced cooling", DEFAULT)
+    data.add("thermal_time_constant_s", "s", 60.0, "a winding without forced cooling", DEFAULT)
 
     rise_A = maximum_V / magnetics.unaligned_inductance_H / rate_hz
     data.add("adc_current_A", "A", _current_range_A(machine, peak_A, rise_A),

@@ -37,8 +37,8 @@ STATOR_POLES = range(PHASES_MIN, PHASES_MAX * (ROTOR_POLES.stop - 1) + 1)
 
 # --- tables ---------------------------------------------------------------------------------------------------------
 
-# The ranges are those of machines from 0.05 to 2000 N m and 12 to 1000 V, and more; whether inertia and friction suit a
-# machine's units in the firmware is checked with them (scaling.py). Defaults are those of ideal devices and sensors.
+# The ranges suit machines from 0.05 to 2000 N m and 12 to 1000 V, and more; whether inertia and friction suit a
+# machine's units in the firmware is checked with them (scaling.py). Defaults stand for ideal devices and sensors.
 
 class Poles(Table):
     stator: Any
@@ -217,7 +217,7 @@ def poles_and_phases(poles: Poles) -> tuple[int, int, int]:
 
 
 def phases_of(stator: int, rotor: int) -> int:
-    """Phases of a machine: the stator poles at one angle of the rotor's pitch are those of a phase. The angles of all
+    """Phases of a machine: the stator poles at one angle of the rotor's pitch make a phase. The angles of all
     poles divide the pitch evenly, so that phases are a stroke apart whichever of the two has more poles."""
     return stator // math.gcd(stator, rotor)
 

@@ -2,7 +2,7 @@
 
 The model is the co-energy W(theta, i), a tensor product of uniform B-splines, cubic in the angle and quartic in the
 current, on half a rotor pitch (mirrored at the aligned and at the unaligned position) times 0 .. the map's greatest
-current. Flux linkage dW/di, torque dW/dtheta, incremental inductance and every further derivative are those of this one
+current. Flux linkage dW/di, torque dW/dtheta, incremental inductance and every further derivative come from this one
 function, so that an integration loses no energy in it. Beyond the greatest current the flux linkage continues linearly
 with its last slope. emulator/plant/flux_map.h evaluates the same coefficients.
 
@@ -46,7 +46,7 @@ MIRROR_TOLERANCE = 0.02  # between the halves of a whole pitch, of the map's gre
 FALL_TOLERANCE = 0.01  # rise away from the aligned position, of the aligned flux linkage at the same current
 MISS_TOLERANCE = 0.02  # between a point and the model, of the map's greatest flux linkage
 RISE_TOLERANCE = 0.05  # above the inductance at lower currents, of the map's greatest flux linkage
-REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of that of the others
+REACH_TOLERANCE = 0.1  # by which an angle's greatest current may fall short of the others'
 
 # From which the aligned position that the symmetry shows is another than 0, electrical (0.42 deg of an 8/6), if it is
 # more than that many times its uncertainty, too: noise and corners of narrow poles look like a shift of half a pitch.

@@ -1,7 +1,7 @@
 """Where a table of flux linkages has its aligned position, found from the symmetry of the machine.
 
 Flux linkage is even about the aligned and about the unaligned position: at each current it is a sum of cosines of
-multiples of the electrical angle from there. The position is that of the least squares of such sums. A table of a whole
+multiples of the electrical angle from there. The position is where such sums have the least squares. A table of a whole
 pitch shows it by the difference of its halves, one of half a pitch by the slope at its aligned end, which must be
 zero. The unaligned end does not count: poles begin to overlap near it, and the corner there looks like a shift.
 """
@@ -137,7 +137,7 @@ def _least(near_rad: float, step_rad: float, squares: Callable[[float], float]) 
 
 
 def _aligned(symmetric_rad: float, angle_rad: np.ndarray, scaled: np.ndarray, harmonics: int) -> float:
-    """The position of more flux linkage: that of symmetry, or the one half a pitch away."""
+    """The position of more flux linkage: the position of symmetry, or the one half a pitch away."""
     basis = _basis(symmetric_rad, angle_rad, harmonics)
     sums = np.linalg.lstsq(basis, np.sum(scaled, axis=1), rcond=1e-3)[0]
     odd = float(np.sum(sums[1::2]))

@@ -1,4 +1,4 @@
-"""Magnetics of one phase by formula: those of `emulator/plant/magnetics.h`, implemented independently in NumPy: the
+"""Magnetics of one phase by formula: as in `emulator/plant/magnetics.h`, implemented independently in NumPy: the
 firmware's tables are computed from them, and the tests compare the emulator with them.
 
 Form: psi = Lu i + f(theta) (g(i) - Lu i), T = f'(theta) W(i), W(i) the integral of g(i) - Lu i. Angles are

@@ -1,7 +1,7 @@
 """Machine image of a drive that is set up for one machine file and runs another machine: the firmware's tables of the
 one, the plant of the other.
 
-Motor, converter, DC link, supply and sensor errors are those of the true machine. The board is that of the firmware:
+Motor, converter, DC link, supply and sensor errors are the true machine's. The board is the firmware's:
 full scales of its sensors, from which the firmware's units follow, and threshold of the comparators.
 """
 

@@ -1,8 +1,8 @@
 """Conduction angles for parts of the largest mean torque at a speed (firmware/control/conduction.h).
 
-The least RMS current of a torque is that of a single pulse that is shorter than the one of the largest torque. Its
+A torque takes the least RMS current with a single pulse that is shorter than the one of the largest torque. Its
 torque pulsates. Torque sharing, whose torque is smooth, takes as little on machines that saturate, and up to a fifth
-more on machines whose torque rises and falls with the angle; the window between its own and that of the pulse of the
+more on machines whose torque rises and falls with the angle; the window between its own and the one of the pulse of the
 largest torque is often smoother still where the voltage has not time enough. So a part of the torque is made by torque
 sharing, by the pulse of the least current, or by what lies between them and the pulse of the largest torque: the
 smoothest that takes at most _MORE_CURRENT of the least current.
@@ -34,7 +34,7 @@ _WAYS = (
     np.array([*_BOTH_WAYS, (12.0, 0.0, 0.0), (12.0, 0.3, 0.0), (12.0, 0.6, 0.0), (12.0, 0.0, 0.5)]),
     np.array(_BOTH_WAYS),
 )
-"""Windows that are tried, motoring and braking: degrees by which that of torque sharing is earlier; way from there to
+"""Windows that are tried, motoring and braking: degrees by which torque sharing's is earlier; way from there to
 the pulse of the largest torque; way from there to the pulse of the least current."""
 _CURRENT_WEIGHT = 2.0
 """Ripple, relatively, that a relative current is worth."""
@@ -59,7 +59,7 @@ _ROUNDS = 3
 """Until the mean torque is the wanted one within _TORQUE_ERROR."""
 _TORQUE_ERROR = 0.02
 _SLOPES = (0.5, 3.0)
-"""Slopes of the logarithm of the mean torque over that of the reference."""
+"""Slopes of the logarithm of the mean torque over the logarithm of the reference."""
 _HIGHER_MAX = 2.0
 """Factor by which a reference may have to be higher for it."""
 _BEYOND = 1e3

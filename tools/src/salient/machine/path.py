@@ -1,4 +1,4 @@
-"""Names of machines: the bundled ones, those of the examples, and files of the user.
+"""Names of machines: the bundled ones, the examples', and files of the user.
 
 Standard library only: a machine whose image is in the cache starts without NumPy and pydantic, which take longer to
 import than the drive to start.
@@ -30,6 +30,6 @@ def machine_path(name_or_path: str) -> Path:
 
 def stated_conditions(path: Path) -> dict[str, Any]:
     """Control rate and sensors that the table [drive] of a machine file states, by the name of their option. The file
-    must be a checked one, as that of a machine_image."""
+    must be a checked one, as the file of a machine_image is."""
     drive = tomllib.loads(path.read_text(encoding="utf-8-sig")).get("drive", {})
     return {name: value for name, value in drive.items() if name in CONDITIONS}

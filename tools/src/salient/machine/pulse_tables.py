@@ -17,7 +17,7 @@ from salient.machine.single_pulse import SinglePulse, single_pulse
 
 _UINT16_MAX, _HALF_TURN = (1 << 16) - 1, 1 << 15
 _INDEX_BITS = 12 + 32 - 22 + 6
-"""Fraction bits of the index at the last speed, less those of a speed and a voltage: the index is
+"""Fraction bits of the index at the last speed, less the bits of a speed and a voltage: the index is
 ((speed_q22 * scale) >> 32) / voltage_q6, 2^12 at the last one."""
 _SCALE_BITS = 31
 _RIPPLE_OFFSET = 0.25

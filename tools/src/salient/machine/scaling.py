@@ -38,7 +38,7 @@ from salient.machine.parameter_table import ParameterDefinition, read_table
 from salient.paths import DRIVE_DBC
 
 VOLTAGE_RANGE_V, LOAD_TORQUE_RANGE_NM = 512.0, 64.0
-"""As CURRENT_RANGE_A, full scales of the sensors in units of the machine, at most; that of the torque transducer
+"""As CURRENT_RANGE_A, full scales of the sensors in units of the machine, at most; the torque transducer's
 always."""
 FLUX_LINKAGE_RANGE_WB, TORQUE_RANGE_NM, SPEED_RANGE_RPM = 4.0, 40.0, 4800.0
 FLUX_LINKAGE_MORE = 2

@@ -2,7 +2,7 @@
 speed and torque.
 
 Angles are electrical degrees past the start of the half of the wanted torque: motoring from the unaligned, braking from
-the aligned position. At standstill they are those of least_current.py. With speed the voltage limits the rate of the
+the aligned position. At standstill they come from least_current.py. With speed the voltage limits the rate of the
 flux linkage: phases follow their shares as far as it permits, the others make up for them as in
 firmware/control/predictive_torque.h, and the best window is one that begins and ends earlier. By how much is found by
 simulation at the base speed; it is proportional to the speed, as is the angle in which a voltage builds up a flux

@@ -27,7 +27,7 @@ POINTS = 17
 SPEED_PER_BASE = (3.0, 5.0)
 """Range of the last speed, as a multiple of the base speed: twice the base speed at 70 % of the voltage is below it."""
 
-# Steps divide a stroke and a lane; between lanes the search interpolates. Its ranges are those of the angles and a lane
+# Steps divide a stroke and a lane; between lanes the search interpolates. Its ranges are the angles' and a lane
 # more where a maximum may be at their end.
 STEP_DEG = 3
 TURN = 360 // STEP_DEG
@@ -133,7 +133,7 @@ class _Sweep:
     square: np.ndarray
     """Sum of the square of the current, A^2 times steps."""
     over: np.ndarray
-    """Largest flux linkage, as a fraction of that of _CURRENT_OVER times the current limit."""
+    """Largest flux linkage, as a fraction of the flux linkage of _CURRENT_OVER times the current limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +311,7 @@ class Phase:
         return torque_Nm
 
     def envelope(self, speed_rad_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angle past the aligned position and flux linkage at which that of the current limit, on its way to the
+        """Angle past the aligned position and flux linkage at which the current limit's, on its way to the
         unaligned position, begins to fall slower than the full opposite voltage takes it down; where it falls fastest
         at a speed at which it never falls faster."""
         limit_Wb = self.fine_limit_Wb

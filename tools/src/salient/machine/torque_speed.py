@@ -61,7 +61,7 @@ def _stroke_torque_Nm(magnetics: Any, phases: int, current_A: np.ndarray) -> np.
 
 
 def current_of_torque_A(magnetics: Any, phases: int, torque_Nm: float, current_max_A: float) -> float:
-    """The smallest current whose smooth torque is torque_Nm, to a ten-thousandth; that of the largest torque up to
+    """The smallest current whose smooth torque is torque_Nm, to a ten-thousandth; the one of the largest torque up to
     current_max_A when none is."""
     grid_A = np.geomspace(1e-6 * current_max_A, current_max_A, _SEARCH_POINTS)
     for _ in range(3):
@@ -102,8 +102,8 @@ def torque_per_flux_Nm_Wb(magnetics: Any, current_A: float) -> float:
 
 
 def _inverse_table(magnetics: Any, current_A: float) -> tuple[np.ndarray, np.ndarray]:
-    """Current by angle (0..180 electrical degrees from aligned) and flux linkage in _FLUX_POINTS up to that of
-    current_A, and the latter by angle."""
+    """Current by angle (0..180 electrical degrees from aligned) and flux linkage in _FLUX_POINTS up to its value
+    at current_A, and the latter by angle."""
     angle_rad = np.arange(181) / 180.0 * magnetics.pitch_rad / 2.0
     grid_A = np.linspace(0.0, current_A, 257)
     flux_Wb = np.maximum.accumulate(magnetics.flux_linkage_Wb(angle_rad[:, None], grid_A[None, :]), axis=1)

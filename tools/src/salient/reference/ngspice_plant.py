@@ -2,7 +2,7 @@
 with.
 
 A source and a diode are the half bridge of a phase (spice/series_diode.cir). Speed is the voltage of a capacitor of J
-farads that the torque charges, 1 A for 1 N m; angle that of one farad that the speed charges. The gate signals are
+farads that the torque charges, 1 A for 1 N m; angle likewise, of one farad that the speed charges. The gate signals are
 XSPICE's digital source, whose file is read as time advances: a PWL source searches all its points at every evaluation.
 """
 

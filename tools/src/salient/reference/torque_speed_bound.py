@@ -4,7 +4,7 @@ torque, of one pulse of voltage in each electrical revolution.
 A phase gets the voltage of the DC link from a turn-on to a turn-off angle and the opposite one after it, through the
 drops and resistances of devices and winding. At the current limit the half bridge chops ideally: the current stays at
 it as long as the opposite voltage suffices. A pair of angles whose current exceeds the limit by more than CURRENT_OVER
-is refused. The flux linkage need not return to zero: what is left over is that of the next revolution. All phases do
+is refused. The flux linkage need not return to zero: what is left over counts in the next revolution. All phases do
 the same, one stroke apart.
 
 The DC link has the voltage of the supply behind its source resistance, with the capacitor between: it sags by the

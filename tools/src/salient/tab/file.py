@@ -1,6 +1,6 @@
 """Puts the page and everything that it needs into one HTML file that makes no request.
 
-The scripts are those of the live page and of the tab, as data: addresses in an import map; module, machines and
+The scripts of the live page and of the tab are data: addresses in an import map; module, machines and
 databases are one packed block.
 """
 

@@ -28,7 +28,7 @@ from salient.target.c_loops import LoopStatement, loop_statements
 from salient.target.control_flow import Block, ControlFlow, Loop, dominators, loops, place, predecessors
 
 CONTROL = "control_handler"
-"""Symbol of the control interrupt's handler; with the suffix _return that of the code after its call."""
+"""Symbol of the control interrupt's handler; with the suffix _return the symbol of the code after its call."""
 
 _Node = tuple[int, int]
 """Number of a copy of a function, address of a block."""
@@ -266,7 +266,7 @@ class Model:
                          " tests/target/bounds.toml")
 
     def _lines(self, copy: _Copy, loop: Loop) -> list[tuple[str, int]]:
-        """Source lines of the instructions of a loop, those of its closing branches first, without inner loops, in the
+        """Source lines of the instructions of a loop, its closing branches' first, without inner loops, in the
         function in which the loop is written: the innermost one, inlined or not, that has all of them."""
         closing = [copy.blocks[begin].instructions[-1] for begin, _ in loop.repeats]
         others = [one for address in sorted(loop.own) for one in copy.blocks[address].instructions]
@@ -458,7 +458,7 @@ class Model:
     def contradiction(self, executed: Mapping[int, int], interrupts: int = 1) -> str | None:
         """Compares the model with executions of each instruction, by address, in a number of interrupts together: None
         when paths of the model add up to them, else the part of the model that they violate. With one interrupt the
-        comparison is exact, with several it is that of their mean."""
+        comparison is exact, with several it is a comparison of their mean."""
         blocks: defaultdict[tuple[Instruction, ...], list[_Node]] = defaultdict(list)
         for node in self._nodes():
             blocks[self._block(node).instructions].append(node)

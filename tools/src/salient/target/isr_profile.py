@@ -19,7 +19,7 @@ EXPERIMENTS = ("start_600", "load_step_150")
 @dataclass(frozen=True)
 class IsrProfile:
     """interrupts: instructions of each control interrupt, from the handler's first to its return; deferred: of each
-    deferred interrupt, without those of control interrupts that pre-empt it. trace: of the same runs."""
+    deferred interrupt, without instructions of control interrupts that pre-empt it. trace: of the same runs."""
 
     interrupts: np.ndarray
     deferred: np.ndarray

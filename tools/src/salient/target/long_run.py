@@ -68,7 +68,7 @@ class Action:
 
 @dataclass(frozen=True)
 class Input:
-    """Actions in order of time; the board is that of the default BenchConfig."""
+    """Actions in order of time; the board is the default BenchConfig's."""
 
     machine: str
     controller: str

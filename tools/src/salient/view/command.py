@@ -65,7 +65,7 @@ class LogFeed:
     def __init__(self, path: Path, carrier: Carrier, node: int, acts: list[Stimulus] | None = None,
                  others: Sequence[Database] = (), rates: BitRates | None = None) -> None:
         """acts: what was done; without it what the log has of that. others: databases of other nodes. rates: by default
-        those of the emulated bus. OtherDatabase: see Carrier. NoKnownFrame."""
+        the emulated bus's. OtherDatabase: see Carrier. NoKnownFrame."""
         self.traffic = TrafficFeed(Traffic(rates or BitRates(DEFAULTS["bit_rate"]), others, node), of_all_time=True)
         self.store = FrameStore(kept=1 << 62)
         chunk = Chunk()
@@ -162,7 +162,7 @@ def _acts_of(notes: dict[str, Any]) -> list[Stimulus] | None:
 
 
 def _log_of(path: Path) -> tuple[Path, dict[str, Any]]:
-    """The log, and the notes beside it in the folder of a failed test; a folder of benches is that of its first."""
+    """The log, and the notes beside it in the folder of a failed test; a folder of benches stands for its first."""
     if not path.is_dir():
         return path, {}
     folder = path if (path / _FAILURE_NOTES).is_file() else path / "0"

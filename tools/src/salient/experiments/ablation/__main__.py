@@ -3,11 +3,11 @@
     python -m salient.experiments.ablation [--only NAME ...] [--out DIR] [--program FILE] [--runs N]
 
 tests/ablation.toml has the mechanisms: each is removed by another text in a file of the firmware, which is compiled and
-linked as in salient.experiments.planted. The runs are those of cases.py: campaign machines, loads, speeds, encoders and
+linked as in salient.experiments.planted. The runs are in cases.py: campaign machines, loads, speeds, encoders and
 imperfections, the same for each mechanism, and with the whole drive for three seeds. A cell of the table is the
-geometric mean of the ratios without / with, and that of the worst tenth, in the parts of the set that the mechanism was
-made for; bold where one exceeds the scatter between the seeds. A mechanism without a bold cell and without failures is
-not missed.
+geometric mean of the ratios without / with, and the mean of the worst tenth, in the parts of the set that the mechanism
+was made for; bold where one exceeds the scatter between the seeds. A mechanism without a bold cell and without failures
+is not missed.
 
 DIR/runs.jsonl keeps the results, so that an interrupted run goes on. A run of all mechanisms writes the table into
 docs/reference/ablation.md.

@@ -20,7 +20,7 @@ Results = Mapping[int, Values | str]
 
 @dataclass(frozen=True)
 class Cost:
-    """Ratios of one measure over the runs of a part: geometric mean, and that of the worst tenth."""
+    """Ratios of one measure over the runs of a part: geometric mean, and the geometric mean of the worst tenth."""
 
     mean: float
     worst: float

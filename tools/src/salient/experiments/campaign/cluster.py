@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> int:
     note = compare(out, first, seeds)
     (out / "cluster.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     print(f"seeds {first} to {first + seeds - 1}: one of two workers killed after {note.get('killed_after')} results, "
-          f"summary {'equal to' if note['equal'] else 'NOT'} that of one computer, byte for byte")
+          f"summary {'equal to' if note['equal'] else 'NOT'} one computer's, byte for byte")
     return 0 if note["equal"] and note["killed"] else 1
 
 

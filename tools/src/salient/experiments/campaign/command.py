@@ -173,6 +173,6 @@ def run_replay(options: argparse.Namespace) -> int:
     causes = ", ".join(names.causes().get(cause, str(cause)) for cause in again.campaign.get("causes", []))
     print(f"first causes: {causes or 'none'}")
     result = f"hash {again.hash}" if again.hash else "the emulator crashed"
-    print(f"{result}, {'equal to' if again.equal else 'NOT that of'} the campaign's; log and plot: {folder}")
+    print(f"{result}, {'equal to' if again.equal else 'NOT equal to'} the campaign's; log and plot: {folder}")
     return 0 if again.equal and set(classes(again.campaign)) <= listed else 1
 

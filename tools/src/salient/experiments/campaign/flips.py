@@ -49,7 +49,7 @@ commanded forwards does not drive backwards."""
 TELLING = {"wrong_status", "wrong_telemetry", "wrong_snapshot", "wrong_torque_telemetry", "wrong_current",
            "wrong_voltage", "wrong_temperature", "wrong_angle"}
 NAMING = {"false_alarm", "wrong_cause", "not_first"}
-"""Rules about the name of a fault: that of a flip has none among those of the bench."""
+"""Rules about the name of a fault: the fault of a flip has none among the bench's."""
 REACTION_US = 10_000
 """Time for a fault after a change of memory, as fault_effects.c has it."""
 DECIDING = ("command", "control.state_machine", "control.duty_q15", "comms.commands", "comms.command", "ramping")
@@ -65,7 +65,7 @@ _ROWS_MAX = 40
 
 
 def classify(flip: Result, without: Result) -> str:
-    """Class of a course with a flip; without: that of the same world without one."""
+    """Class of a course with a flip; without: the course of the same world without one."""
     if flip["signal"]:
         return "crash"
     broken = hazards(flip, without)

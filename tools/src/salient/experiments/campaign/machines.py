@@ -1,4 +1,4 @@
-"""The machines of a campaign: those of the repository and random ones, drawn beforehand."""
+"""The machines of a campaign: the repository's and random ones, drawn beforehand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RANDOM = range(10)
 
 @lru_cache
 def files() -> tuple[Path, ...]:
-    """Machine files by number; the first is that of the paper."""
+    """Machine files by number; the first is the paper's."""
     first = MACHINES / "saturating.toml"
     bundled = [path for path in sorted(MACHINES.glob("*.toml")) if path != first]
     return (first, *bundled, *sorted(EXAMPLES.glob("*.toml")), *random_files(RANDOM))

@@ -115,7 +115,7 @@ def _cluster() -> tuple[str, str, str]:
     return ("a Dask scheduler with two workers, one of them killed",
             f"seeds {_seeds(note)} at {note['commit']}, a worker killed after {note['killed_after']:,} results; the "
             "summary, with the digest of all results, " + ("equals" if note["equal"] else "**differs from**")
-            + " that of one computer byte for byte", f"`{_MODULE}.cluster DIR`")
+            + " one computer's byte for byte", f"`{_MODULE}.cluster DIR`")
 
 
 def _bits() -> tuple[str, str, str]:

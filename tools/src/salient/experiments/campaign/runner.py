@@ -26,7 +26,7 @@ ALL_EVENTS = 2**64 - 1
 
 @dataclass(frozen=True)
 class Programs:
-    """Other programs than those of the build: the campaign's, and drive and test bench (salient_host)."""
+    """Other programs than the build's: the campaign's, and drive and test bench (salient_host)."""
 
     campaign: Path
     host: Path
@@ -49,7 +49,7 @@ def digest() -> str:
 
 
 _RESULTS = ("docs", "tests/campaign", "tests/*.json", "tools/studies")
-"""Committed results and documents, of which one measurement changes those of another."""
+"""Committed results and documents, of which one measurement changes another's."""
 
 
 def commit() -> str:
@@ -84,7 +84,7 @@ def world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False) -> Result:
 
 def run_world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, frames: Path | None = None,
               programs: Programs | None = None) -> Result:
-    """Runs a world, with those of its events whose bits are set. frames: a file for the frames that its clients sent, a
+    """Runs a world, with the events whose bits are set. frames: a file for the frames that its clients sent, a
     line each: time in ns, number of the client, identifier with flags and data in hexadecimal."""
     options = ["--first", seed, "--keep", kept, *_mode(healthy), *(["--frames", frames] if frames else [])]
     return _lines(options, programs)[0]

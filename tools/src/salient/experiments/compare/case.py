@@ -49,8 +49,8 @@ class Group:
     columns: (metric, statistic) of its rows, as far as its runs have them. The statistic is "" for a single run, else
     median, worst (maximum), spread (maximum over median), gap (widest between angles, modulo STROKE_DEG) or count (of
     failed runs). long: runs only when named. worst: metrics of which the ten worst runs are named below the table.
-    ratios: metric -> its quotient by that of the first sample with the same extractor, of the condition or of the one
-    that it is relative to, a metric of its own.
+    ratios: metric -> its quotient by the metric of the first sample with the same extractor, of the condition or of
+    the one that it is relative to, a metric of its own.
     """
 
     title: str

@@ -33,7 +33,7 @@ from salient.experiments.compare.case import (
 from salient.experiments.scenario import LoadStep, Record, Scenario, SpeedStep
 from salient.toml_file import toml_value
 
-# Parameters of the drive that conditions set, by meaning; the numbers are those of docs/reference/parameters.md.
+# Parameters of the drive that conditions set, by meaning; the numbers are in docs/reference/parameters.md.
 LOAD_KNOWN: dict[str, float] = {"load_source": 1}
 PULSES: dict[int, dict[str, float]] = {1: {"pulses_per_period": 1}, 2: {"pulses_per_period": 2}}
 RESERVE = {"torque_reserve_Nm": 8.0}
@@ -353,7 +353,7 @@ def scenario_toml(case: Case) -> str:
     for key, value in vars(scenario).items():
         if key in ("name", "machine", "controller") or value is None or (
                 key not in CONDITIONS and value == getattr(plain, key)):
-            continue  # what is left out of the conditions would be that of the machine file
+            continue  # what is left out of the conditions would come from the machine file
         if isinstance(value, Mapping):
             tables.append((f"[{key}]", value))
         elif isinstance(value, tuple):

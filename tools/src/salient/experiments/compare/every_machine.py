@@ -1,9 +1,9 @@
-"""Machines of all sizes: those of tools/examples/machines and random ones, each with its drive's data derived.
+"""Machines of all sizes: the examples in tools/examples/machines and random ones, each with its drive's data derived.
 
 A run starts to 0.4 of the base speed, takes half of the rated torque at a quarter of it, and with `salient` brakes to
 that speed before and reverses after. The start, the braking and the reversal are compared with what torque limit,
-inertia and voltage permit (machine/torque_speed.py), the torque ripple of `salient` under the load with that of its
-reference model (compare/reference.py).
+inertia and voltage permit (machine/torque_speed.py), the torque ripple of `salient` under the load with its
+reference model's (compare/reference.py).
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def is_allowed(scenario: Scenario) -> bool:
 
 def cases_of(cases: Iterable[Case], on: Subject, quick: bool = False) -> list[Case]:
     """The cases of the paper's machine among `cases`, for another machine, and its own runs of the groups `machines`
-    and those of speed_range.py, count_cases.py and mismatch.py."""
+    and the groups of speed_range.py, count_cases.py and mismatch.py."""
     of_paper, sized = [], {}
     groups: dict[str, None] = {}
     for case in cases:

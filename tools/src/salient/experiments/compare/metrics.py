@@ -188,7 +188,7 @@ def counts_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window =
 
 def moving_metrics(scenario: Scenario, recording: np.ndarray, window_s: Window = PAPER_WINDOW_S) -> Metrics:
     """Peak-to-peak speed over the whole recording, which is the steady state under a periodic load; under a sine also
-    relative to that of a shaft that only the sine moves."""
+    relative to the swing of a shaft that only the sine moves."""
     swing_rpm = float(np.ptp(recording["speed_rpm"]))
     free_rpm = _free_swing_rpm(scenario)
     return {"speed_swing_rpm": swing_rpm, **({"swing_of_free": swing_rpm / free_rpm} if free_rpm else {})}

@@ -1,6 +1,6 @@
 """Cost of a wrong machine file: the drive on one with a stated error (wrong_files.py), the motor of the right one.
 
-Speeds and loads are those of the right machine, and each figure is beside that of the drive on the right file.
+Speeds and loads are the right machine's, and each figure is beside the figure of the drive on the right file.
 
 A displaced angle is an offset of the encoder: no machine file has one, and the loader refuses a map that is symmetric
 about another angle than 0.
@@ -31,7 +31,7 @@ from salient.paths import EXAMPLE_MACHINES
 from salient.paths import MACHINES as MACHINE_FILES
 
 GROUP, FILES = "mismatch", "machines"
-"""The group, and the folder of the machine files in that of the results."""
+"""The group, and the folder of the machine files in the folder of the results."""
 RIGHT = "right file"
 PROMISED = ("flux linkage x 1.1", "resistance x 0.7", "inertia x 0.5", "inertia x 2", "friction x 0.2", "friction x 5",
             "angle 0.5 deg", "angle 1 deg")
@@ -183,7 +183,7 @@ def fast_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
 
 
 def _torque(scenario: Scenario, recording: np.ndarray) -> tuple[float, float, float]:
-    """Mean torque of the first whole electrical revolutions in N m, its error, and that of the last ones, in %."""
+    """Mean torque of the first whole electrical revolutions in N m, its error, and the error of the last ones, in %."""
     assert scenario.record is not None  # every case is recorded
     rows = round((scenario.duration_s - scenario.record.from_s - LEARNED_S) / (1e-6 * scenario.record.step_us))
     means_Nm = [float(np.mean(part, dtype=float)) for part in (

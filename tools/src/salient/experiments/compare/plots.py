@@ -398,7 +398,7 @@ _PLOTS: dict[str, tuple[tuple[str, str, Callable[[Content], Figure | None]], ...
                   " the rotor angles, by speed. Short lines: target.", _curves(
         "encoders", (("against_periods", "worst"),), lambda parts: (
             ", ".join((parts[0], *parts[1].split(" and ")[1:])), parts[2], _number(parts[1])), "bits")),),
-    "misalignment": (("Learning of a misalignment", "Torque ripple relative to that of the aligned drive, by speed."
+    "misalignment": (("Learning of a misalignment", "Torque ripple relative to the aligned drive's, by speed."
                       " Short lines: target.", _curves(
         "misalignment", (("ripple_3s_ratio", ""), ("ripple_6s_ratio", "")),
         lambda parts: (", ".join((parts[0], *parts[3:])), parts[1], _number(parts[2])), "misalignment / deg")),),

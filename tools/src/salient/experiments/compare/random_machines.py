@@ -1,6 +1,6 @@
 """Random machines of plausible proportions, reproducible by number: machine files without a table [drive].
 
-The proportions are those of built machines: the flux linkage that the voltage builds up at base speed, the energy that
+The proportions are as in built machines: the flux linkage that the voltage builds up at base speed, the energy that
 a stroke converts, saturation at a third of the peak current, inductance ratios of 6 to 14, inertias that grow with the
 5/3rd power of the torque.
 """
@@ -40,7 +40,7 @@ WHOLE_RANGE = Spread(20261127, (0.05, 2000.0), (*USUAL.supplies_V, 36.0, 240.0, 
 
 
 def random_machine(number: int, spread: Spread = USUAL) -> str:
-    """The text of a machine file, number 0 or more; those of `compare machines` are below COUNT."""
+    """The text of a machine file, number 0 or more; numbers of `compare machines` are below COUNT."""
     draw = np.random.default_rng((spread.seed, number))
 
     def between(low: float, high: float) -> float:

@@ -24,7 +24,7 @@ _ARC = {3: (0.345, 0.45), 4: (0.3, 0.45)}
 """Arcs of the stator poles, in pitches, by phases."""
 _ANGLES, _CURRENTS = 97, 17
 _CURRENT_OVER = 2.0
-"""Largest current of the map over that of the machine."""
+"""Largest current of the map over the machine's."""
 
 
 def random_map(number: int) -> tuple[str, str]:

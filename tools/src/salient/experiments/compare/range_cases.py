@@ -100,7 +100,7 @@ def _load_step(speed_rpm: float, **fields: Any) -> Scenario:
 
 
 def misalignment(quick: bool) -> Iterator[Case]:
-    """Ripple of misaligned drives after 3 and 6 s, next to that of aligned ones, which are the first samples."""
+    """Ripple of misaligned drives after 3 and 6 s, next to the ripple of aligned ones, which are the first samples."""
     for machine in TWO_MACHINES[:1] if quick else TWO_MACHINES:
         for speed_rpm in (600.0,) if quick else OFFSET_SPEEDS_RPM:
             for offset_deg in (0.5,) if quick else OFFSETS_DEG:

@@ -3,7 +3,7 @@ its tables (reference/torque_speed_bound.py, reference/copper_bound.py).
 
 - torque_speed: the largest torque in torque mode, motoring and braking, on a shaft that a dynamometer holds.
 - torque_speed_random: the same with ten random machines, which no other group has.
-- partial_torque: parts of it above base speed; the RMS current is compared with that of the best pulse.
+- partial_torque: parts of it above base speed; the RMS current is compared with the best pulse's.
 - copper: parts of the rated torque up to base speed; the sum of squares of the currents is compared with the least one
   without ripple at that speed.
 - copper_random: the same with random machines of narrow pole arcs, by map.
@@ -59,7 +59,7 @@ MOTORING_SHORT_PERCENT, BRAKING_SHORT_PERCENT = 3.0, 8.0
 PEAK_TO_LIMIT_MAX = 1.03
 UP_TO_BASE, UP_TO_BASE_QUICK = (0.1, 0.5, 1.0), (0.1,)
 COPPER_RATIO_MAX, COPPER_RIPPLE_MAX = 1.06, 0.045
-"""Largest copper ratio and ripple; the latter is that of single samples of a machine of 8/6 poles at its base speed, in
+"""Largest copper ratio and ripple; the latter comes from single samples of a machine of 8/6 poles at its base speed, in
 27 control periods of a stroke."""
 RMS_RATIO_MAX, TORQUE_ERROR_MAX_PERCENT = 1.1, 3.0
 
@@ -288,7 +288,7 @@ def of_any_machine(quick: bool, path: str) -> Iterator[Case]:
 
 GROUPS = {"torque_speed": torque_speed, "partial_torque": partial_torque, "copper": copper, "transition": transition,
           "torque_conditions": torque_conditions}
-"""With --machine, a machine's own cases instead of those of the paper's machine in its terms."""
+"""With --machine, a machine's own cases instead of the cases of the paper's machine in its terms."""
 
 
 # --- metrics --------------------------------------------------------------------------------------------------------
@@ -309,7 +309,7 @@ def held_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
 
 
 def held_part_metrics(scenario: Scenario, recording: np.ndarray) -> Metrics:
-    """RMS current of a phase relative to that of the best pulse of the same mean torque, and the torque's error."""
+    """RMS current of a phase relative to the best pulse's of the same mean torque, and the torque's error."""
     (step,) = scenario.torque
     torque_Nm = np.asarray(recording["torque_Nm"], dtype=float)
     mean_Nm = float(torque_Nm.mean())

@@ -1,7 +1,7 @@
 """Machine files with a stated error, beside the right one: a file of the firmware for the motor of another.
 
 The error of the magnetics is one of the flux linkage psi(theta, i) as a whole, so that torque, co-energy and inductance
-agree with each other and the loader takes them for those of a machine. psi_a, psi_u: rotor aligned, unaligned.
+agree with each other and the loader takes them for a machine's. psi_a, psi_u: rotor aligned, unaligned.
 
 - saturation s: psi' = s psi(theta, i / s); the iron saturates at s times the current and flux linkage, inductances
   without saturation stay
@@ -32,7 +32,7 @@ FOLDER = BUILD / "mismatch"
 
 @dataclass(frozen=True)
 class Fault:
-    """Error of a machine file: factors of its values, by those of the motor. angle_deg: by which the encoder's zero is
+    """Error of a machine file: factors of its values, by the motor's. angle_deg: by which the encoder's zero is
     displaced from the aligned position, mechanical; no key of a file has it."""
 
     flux: float = 1.0

@@ -42,7 +42,7 @@ OFFSET_MAX = 0.02  # at 0 A, of the map's greatest flux linkage
 PLACE_MAX = 0.03  # of a phase from its place a stroke after the one before, of a pitch
 HALF_ERROR_RAD = 2.0 * math.pi / 80.0  # of the aligned position of half a pitch, which is shifted to 0
 GAP_RAD = math.pi / 6.0  # without points, electrical
-_TOP_STEP = 3  # of the angles that are tried as that of the greatest slope
+_TOP_STEP = 3  # of the angles that are tried as the angle of the greatest slope
 ANGLES_MIN = 8
 CURRENTS_MIN = 6
 
@@ -167,7 +167,7 @@ def _in_radians(table: np.ndarray, unit: str | None, rotor_poles: int) -> tuple[
 
 def _misfit(table: np.ndarray) -> float | None:
     """How far the largest current's curve of the first phase is from one that falls from its greatest to its smallest
-    value half a pitch away and rises again; None where the angles are not those of half a pitch to a revolution."""
+    value half a pitch away and rises again; None where the angles do not cover half a pitch to a revolution."""
     first = table[table[:, 1] == table[0, 1]]
     turned_rad, flux = first[:, 2], first[:, 4] / np.maximum(first[:, 3], 1e-300)
     angle_rad = np.unique(turned_rad)
@@ -210,7 +210,7 @@ def _curves(table: np.ndarray, lines: list[str]) -> tuple[np.ndarray, list[_Phas
     current_A = longest[1][longest[1] < 0.999 * least_A]
     current_A = np.append(current_A, least_A)
     if any(len(of) != len(longest[1]) or np.max(np.abs(of - longest[1])) > 1e-6 * least_A for _, of, _, _ in every):
-        lines.append("currents: those of one angle, by interpolation at the others")
+        lines.append("currents: as at one angle, by interpolation at the others")
     _say_offset(table, every, lines)
     phases = []
     for name, group in zip(names, curves, strict=True):
@@ -267,12 +267,12 @@ def _origin(phase: _Phase) -> Origin:
 
 
 def _is_whole(phase: _Phase) -> bool:
-    """Whether the points are those of a whole pitch."""
+    """Whether the points cover a whole pitch."""
     return float(phase.angle_rad[-1] - phase.angle_rad[0]) >= WHOLE_RAD
 
 
 def _is_at_end(origin: Origin) -> bool:
-    """Whether the aligned position is that of an angle of 0 or of half a pitch."""
+    """Whether the aligned position is at an angle of 0 or of half a pitch."""
     return math.remainder(origin.aligned_rad, math.pi) == 0.0
 
 
@@ -408,7 +408,7 @@ def _compare_phases(means: Sequence[np.ndarray], most_Wb: float, current_A: np.n
 
 def _monotonic(flux_Wb: np.ndarray, current_A: np.ndarray) -> np.ndarray:
     """The nearest map that falls from aligned to unaligned, and rises with the current by at least a thousandth of the
-    mean inductance: that of a coil without iron is never 0."""
+    mean inductance: the inductance of a coil without iron is never 0."""
     changed = flux_Wb.copy()
     rise_Wb = 1e-3 * float(np.max(flux_Wb)) * current_A / current_A[-1]
     for _ in range(3):

@@ -72,7 +72,7 @@ def points_of(found: Sequence[Block]) -> Points:
 
 
 def _of_flux(blocks: Sequence[Block]) -> list[Block]:
-    """The blocks without those of other quantities. FluxMapError: there is no other."""
+    """The blocks without the ones of other quantities. FluxMapError: there is no other."""
     kept = [block for block in blocks if (of := _quantity(block)) is None or of.role != "other"]
     if blocks and not kept:
         raise FluxMapError(f"line {blocks[0].rows[0].line}: {blocks[0].titles[-1]!r:.60} above it: no flux linkage or"

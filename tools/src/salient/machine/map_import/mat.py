@@ -16,7 +16,7 @@ from salient.machine.map_import.text import Block, Row
 
 
 def is_mat(data: bytes) -> bool:
-    """Whether a file's first bytes are those of a MAT file of version 5 or 7.3."""
+    """Whether a file begins as a MAT file of version 5 or 7.3 does."""
     return data[:10] == b"MATLAB 5.0" or is_hdf5(data)
 
 
@@ -54,7 +54,7 @@ Axis = tuple[int, Column | None, np.ndarray]
 
 
 def _arrays(values: dict[str, Any]) -> dict[str, np.ndarray]:
-    """All arrays of numbers, those of structures by the name of their field."""
+    """All arrays of numbers, arrays of structures by the name of their field."""
     found: dict[str, np.ndarray] = {}
     for name, value in values.items():
         array = np.asarray(value)

@@ -23,7 +23,7 @@ export function protect(dataId, counter, data) {
     data[1] = crc >> 8;
 }
 
-/** CRC-32 of IEEE 802.3, continued from that of the bytes before. */
+/** CRC-32 of IEEE 802.3, continued from the CRC of the bytes before. */
 export function crc32(bytes, before = 0) {
     let crc = ~before >>> 0;
     for (const byte of bytes) {

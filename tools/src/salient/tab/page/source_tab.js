@@ -43,7 +43,7 @@ export class TabSource {
         this.setting = setting;
         this.columns = new Columns();
         this.stopped = false;
-        this.pace = 1; // of virtual time to that of the wall
+        this.pace = 1; // virtual time over wall time
         this.takeFrames = () => {};
         this.takeNotice = () => {};
         /** Called when a run begins again at an earlier time, when a compared hash is known, and at the end of a link. */

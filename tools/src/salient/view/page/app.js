@@ -391,7 +391,7 @@ class Page {
             `${end_s} s · ${bus} · ${this.store.lost} lost · ${Math.round(drawn)} fps`;
         const picture = this.state.isTrue ? "True angle and currents of the test bench"
             : "Angle and currents as the drive measures them";
-        element("picture-source").textContent = `${picture}. Flux linkage is not on the bus: it is that of the machine `
+        element("picture-source").textContent = `${picture}. Flux linkage is not on the bus: it comes from the machine `
             + "file's map. + both switches on, 0 one on, − both off: mean between two samples, from the winding's voltage.";
         const reported = this.hash.last;
         if (Number.isFinite(reported) && reported !== this.info.database_hash && !this.toldHash) {

@@ -155,7 +155,7 @@ export class Charts {
         new ResizeObserver(() => this.resize()).observe(root);
     }
 
-    /** Shows these signals, those of a unit together, in the order in which the units come. */
+    /** Shows these signals, signals of one unit together, in the order in which the units come. */
     show(list) {
         this.plots.forEach((plot) => {
             plot.plot.destroy();
@@ -172,7 +172,7 @@ export class Charts {
         this.resize();
     }
 
-    /** The name of a signal, with that of its message where another one shown is called the same. */
+    /** The name of a signal, with the name of its message where another one shown is called the same. */
     shortName(series) {
         const same = this.list.filter((other) => other.signal.name === series.signal.name);
         return same.length > 1 ? series.name : series.signal.name;

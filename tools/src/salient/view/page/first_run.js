@@ -224,7 +224,7 @@ export class FirstRun {
         }[step];
         const wanted = document.querySelector(control);
         if (wanted === null) {
-            return null; // the list of faults is that of a held time
+            return null; // the list of faults belongs to a held time
         }
         const panel = wanted.closest("[role=tabpanel]");
         return panel.hidden ? element(`${panel.id}-tab`) : wanted;
