@@ -8,7 +8,7 @@
  *
  * Second sender: both command messages have one sequence counter, and while the drive is armed the receiver stays with
  * the sender that it followed when it was armed. A frame of another one is invalid, but for the few whose counter is by
- * chance the next; then those of the first are. Every invalid command frame (length, checksum, counter, range) adds
+ * chance the next; then the first sender's are. Every invalid command frame (length, checksum, counter, range) adds
  * COMMANDS_ERROR_STEP to a count, every valid one takes 1 from it; COMMANDS_ERRORS_MAX invalid ones in succession,
  * or among fewer than COMMANDS_ERROR_STEP valid ones, are the fault command_error. Up to two frames lost in
  * succession are no error; nor is the last accepted frame once more, same counter and same checksum, as a gateway or
@@ -20,7 +20,7 @@
  * to be counted.
  *
  * PARAMETER_WRITE and PARAMETER_SET_CONTROL pass while the drive is armed for configuration. Their sequence counter
- * continues that of confirm_configuration, whose sender the receiver stays with. They are no commands: invalid ones are
+ * continues confirm_configuration's, whose sender the receiver stays with. They are no commands: invalid ones are
  * counted, but no fault. */
 #ifndef COMMS_COMMANDS_H
 #define COMMS_COMMANDS_H

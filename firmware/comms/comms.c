@@ -20,7 +20,7 @@ void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
     telemetry_init(&comms->telemetry, offset, time_us);
 }
 
-/* A bit that has changed in one copy is that of both others again. */
+/* A bit that has changed in one copy is as in both others again. */
 static void restore_node(comms_t *comms) {
     const uint32_t sends = comms->telemetry.identifier_offset, hears = comms->commands.data_id_offset;
     const uint32_t offset = (sends & hears) | (comms->node_offset & (sends | hears));
@@ -68,8 +68,8 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
     }
 }
 
-/* Frames of XCP that are no response to a single command: those of an upload wait with the responses, those of a
- * measurement are for a bus on which the drive has nothing else to send. */
+/* Frames of XCP that are no response to a single command: an upload's wait with the responses, a
+ * measurement's are for a bus on which the drive has nothing else to send. */
 COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parameters) {
     hal_can_frame_t frame;
     while (comms->xcp.upload_left > 0 && frame_queue_free(&comms->responses) > 1u &&

@@ -37,7 +37,7 @@
 #define COMMS_FRAMES_PER_CALL 4
 
 /* Telemetry fills no mailbox in this time after a challenge, unless the attempt to arm ends: most of its identifiers
- * are lower than that of DRIVE_ARMING, and the host waits for the challenge. The frames wait in their queue. */
+ * are lower than DRIVE_ARMING's, and the host waits for the challenge. The frames wait in their queue. */
 #define COMMS_CHALLENGE_FIRST_US 500u
 
 typedef struct {

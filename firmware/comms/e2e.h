@@ -49,7 +49,7 @@ void e2e_receiver_init(e2e_receiver_t *receiver);
  * gateway that hangs, and sends it for ever, is no sender that starts again. */
 void e2e_receiver_restart(e2e_receiver_t *receiver);
 
-/* True when a frame's checksum is that of its data and data ID; false for one shorter than the header. */
+/* True when a frame's checksum matches its data and data ID; false for one shorter than the header. */
 bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length);
 
 /* Checks a received frame of a message; messages with one sequence counter share a receiver. Its data may be used only

@@ -41,7 +41,7 @@ COLD void telemetry_set_period(telemetry_t *telemetry, drive_telemetry_rate_t ra
     telemetry->period[rate] = (uint16_t)period;
 }
 
-/* Counts down the cycles to a message; true when it is due now. More cycles than the period has are those of a count
+/* Counts down the cycles to a message; true when it is due now. More cycles than the period has come from a count
  * that has changed in memory. */
 static bool count_down(uint16_t *cycles_left, uint16_t period) {
     const bool due = *cycles_left == 0 || *cycles_left > period;

@@ -8,7 +8,7 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* Items of a period, two in a part, as drive.dbc lists them: those of the first phases, then those of the others. */
+/* Items of a period, two in a part, as drive.dbc lists them: the first phases', then the others'. */
 enum { FIRST_PHASES = 4, MORE_PHASES = 2 };
 enum { DC_LINK_VOLTAGE = FIRST_PHASES, ANGLE, SPEED, TORQUE_REFERENCE, UPPER };
 enum { LOWER = UPPER + FIRST_PHASES, FIRST_ITEMS = LOWER + FIRST_PHASES, ITEMS = FIRST_ITEMS + 3 * MORE_PHASES };

@@ -13,7 +13,7 @@
  *               too (EPK), and the names of the events
  *
  * Reading is free. Measuring, which takes time of the interrupts, and the triggered buffer need resource DAQ, writing a
- * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as that of the
+ * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as the key of the
  * arming: a random or recorded frame opens nothing. A seed serves one attempt within ARMING_RESPONSE_MAX_US. Both are
  * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a
  * command.
@@ -52,7 +52,7 @@
 /* Words of the area of the triggered buffer. */
 typedef enum {
     XCP_SCOPE_COMMAND, /* 0: stop, 1: arm, 2: trigger now */
-    XCP_SCOPE_EVENT,   /* the next members are those of sampler_setup_t */
+    XCP_SCOPE_EVENT,   /* the next members are sampler_setup_t's */
     XCP_SCOPE_DIVIDER,
     XCP_SCOPE_BEFORE,
     XCP_SCOPE_CONDITION,

@@ -142,7 +142,7 @@ static observer_bandwidth_parameters_t bandwidth_from(const int32_t *values, boo
 }
 
 /* Far from the sliding surface the reaching law asks for the torque J k / epsilon. On a light machine that would be
- * less than the torque limit: epsilon is then reduced until it is 5/4 of it. Near the surface the law is that of k
+ * less than the torque limit: epsilon is then reduced until it is 5/4 of it. Near the surface the law is the one of k
  * alone. */
 static int32_t epsilon_q31(const int32_t *values, int32_t gain_q24) {
     const int64_t set_q31 = (int64_t)values[PARAMETER_SMC_EPSILON] << 15;

@@ -42,7 +42,7 @@ static pwm_ditc_parameters_t duty_from(const configure_source_t *from) {
 
 /* Largest current, A, Q7.9, from which full voltage for some tenths of a control period drives no phase above the trip,
  * at any angle. By the flux linkage: a saturated phase has less inductance than at the unaligned position, where the
- * flux linkage of a voltage is that of the current which it drives. */
+ * flux linkage of a voltage is the flux linkage of the current which it drives. */
 static int32_t highest_before_trip_q9(const int32_t *values, const machine_tables_t *tables, uint32_t control_rate_hz,
                                       unsigned tenths) {
     const int32_t trip_q9 = values[PARAMETER_CURRENT_TRIP_A];
@@ -84,7 +84,7 @@ static void limit_currents(control_parameters_t *control, const int32_t *values,
     control->duty.ceiling_gain_q24 = fixed_saturate(fixed_divide((int64_t)1 << 33, period_q9));
 }
 
-/* A period's flux linkage at full voltage is that of the rise of the current at the unaligned position. */
+/* A period's flux linkage at full voltage is the flux linkage of the rise of the current at the unaligned position. */
 static void set_reference_point(control_parameters_t *control, const int32_t *values, const machine_tables_t *tables,
                                 uint32_t control_rate_hz) {
     const int64_t rise_q9 = fixed_divide((int64_t)tables->current_slew_rate_A_s << 9, control_rate_hz);

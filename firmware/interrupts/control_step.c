@@ -24,7 +24,7 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
     deferred_reset_run(state);
 }
 
-/* The first sample initialises what compares successive samples; all else is that of control_reset. */
+/* The first sample initialises what compares successive samples; all else is as after control_reset. */
 static void start(control_state_t *state) {
     state->started = true;
     load_observer_reset(&state->observer, state->measurement.angle);

@@ -304,7 +304,7 @@ COLD void deferred_tune(const control_parameters_t *parameters, control_state_t 
     }
 }
 
-/* In single pulse operation the level makes the torque that of the reference, and the offset returns to 0: one that
+/* In single pulse operation the level makes the torque equal the reference, and the offset returns to 0: one that
  * came from the shortfall before would remain. Above base speed, where the windows stay where there is hardly any
  * shortfall, the offset makes up for it. */
 static void step_torque_offset(const control_parameters_t *parameters, deferred_t *deferred,

@@ -50,7 +50,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
  * [control interrupt, or background in a critical section] */
 void deferred_reset_run(control_state_t *state);
 
-/* Makes the speed law that of changed parameters; no other state follows from tunable ones (parameters.h). [background,
+/* Makes the speed law follow changed parameters; no other state follows from tunable ones (parameters.h). [background,
  * in a critical section] */
 void deferred_tune(const control_parameters_t *parameters, control_state_t *state);
 

@@ -9,7 +9,7 @@
  * skipped.
  *
  * Resets: the control interrupt that resets something changes the generation, and uses its own initial results until
- * those of a step with an input of the present generation arrive. So a late step cannot undo a reset. The deferred step
+ * a step's with an input of the present generation arrive. So a late step cannot undo a reset. The deferred step
  * resets its own state when it sees another generation.
  */
 #ifndef INTERRUPTS_DEFERRED_EXCHANGE_H

@@ -73,7 +73,7 @@ typedef struct {
     sampler_setup_t setup;
     uint32_t record_words;   /* the channels; before them in a stream the time, us */
     uint32_t capacity;       /* of the ring, records */
-    uint32_t place;          /* of the next record in the ring, words; of a complete buffer that of the oldest one */
+    uint32_t place;          /* of the next record in the ring, words; of a complete buffer the place of the oldest */
     uint32_t missing;        /* records by which fewer than `before` precede the trigger */
     uint32_t following;      /* records from the trigger on that are still to be written */
     uint32_t countdown;      /* events to the next record */

@@ -7,7 +7,7 @@
  *                duties outside of a run, which a changed state has ended, in every call
  *   parameters   the parameters in effect against their sum, each SELF_TEST_STEP_US
  *   stack        the guard word at its end, in every call; how much of it has never been used, in a second
- *   registers    those of the port, each SELF_TEST_STEP_US
+ *   registers    the port's, each SELF_TEST_STEP_US
  *   code         the CRC of the program, as a whole at the start and then four words each SELF_TEST_STEP_US
  *   clock        time against the second clock over SELF_TEST_CLOCK_US, within 5 %
  *

@@ -15,7 +15,7 @@ int32_t speed_control_limited_q22(const control_parameters_t *parameters, int32_
 /* Computes law torque, limits of the torque reference and speed reference of the results, and the mode.
  *
  * Speed mode: moves the speed reference by at most the ramp towards the commanded speed, from the present speed at the
- * start of a run, or 0 without a run request; the torque is that of the configured law without feed-forward. Torque
+ * start of a run, or 0 without a run request; the torque is the configured law's without feed-forward. Torque
  * mode: torque_mode.h. It begins with the present torque; after it the speed reference begins with the present speed,
  * and the integral of the PI with the present torque. limit_q24: of the torque's magnitude, N m, Q7.24, >= 0; what the
  * interrupt adds is within it too. [deferred interrupt] */
@@ -29,7 +29,7 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
 void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
                                    deferred_speed_results_t *results);
 
-/* Torque reference: that of the law, and with sliding mode the feed-forward of load and friction, limited.
+/* Torque reference: the law's, and with sliding mode the feed-forward of load and friction, limited.
  * [control interrupt] */
 int32_t speed_control_torque_q24(const control_parameters_t *parameters, const load_observer_t *observer,
                                  const control_sample_t *sample, const deferred_results_t *deferred);

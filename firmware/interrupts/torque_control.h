@@ -12,7 +12,7 @@ void torque_control_reset(const control_parameters_t *parameters, control_state_
 /* Sets the duties of all phases by the configured law. The observer has predicted the coming sample before. */
 void torque_control(const control_parameters_t *parameters, control_state_t *state, const deferred_results_t *deferred);
 
-/* Limit of the currents of hysteresis control at a speed, rad/s, Q9.22; its results are those of the next period:
+/* Limit of the currents of hysteresis control at a speed, rad/s, Q9.22; its results are for the next period:
  * 10 of the computed bound of traditional. [deferred interrupt] */
 ditc_hysteresis_limit_t torque_control_limit(const control_parameters_t *parameters, int32_t speed_q22);
 

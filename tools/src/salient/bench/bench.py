@@ -23,7 +23,7 @@ class Bench(Session):
     """A session with an emulator that it starts and ends.
 
     config: its pace is not used, a bench is in lock-step; its telemetry_period_ms is 1 unless stated,
-    with several drives that of the parameter. can: "unix:PATH" or "socketcan:INTERFACE", one bench at
+    with several drives the parameter's. can: "unix:PATH" or "socketcan:INTERFACE", one bench at
     a time on an interface. options: the configuration. simulator: the process.
     """
 

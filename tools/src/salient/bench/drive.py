@@ -68,7 +68,7 @@ class DriveNotReady(DriveError):
 
 def command_frame(counter: int, request: str, speed_reference_rpm: float, message: Message = _COMMAND) -> can.Message:
     """A DRIVE_COMMAND with its checksum. counter 0..255; request one of REQUESTS; the speed within the range of the
-    message, which is that of the drive's DBC."""
+    message in the drive's DBC."""
     return _protected(message, counter, request, {"speed_reference_rpm": speed_reference_rpm})
 
 
@@ -88,7 +88,7 @@ class Drive(KnownAttributes):
     Nothing is sent before the first request. A request to run arms a drive that is not armed, while time advances: the
     drive runs about a millisecond later. One that was disarmed by a fault stays so until the next request.
     OtherDatabase instead of a request to run when the drive's DBC is another
-    than that of the session (Session.require_drive_database); off, stop and clear_fault have no scaling.
+    than the session's (Session.require_drive_database); off, stop and clear_fault have no scaling.
     """
 
     command_due_ns: int | None
@@ -123,7 +123,7 @@ class Drive(KnownAttributes):
 
     @property
     def speed_reference_rpm(self) -> float:
-        """Last requested value, in the range of the drive's DBC, which is that of the machine; negative is reverse, and
+        """Last requested value, in the range of the drive's DBC, which is the machine's; negative is reverse, and
         0 to a controller that drives forward only. DriveError out of that range, and below lowest_speed_rpm but for 0.
         The drive limits it to 7/8 of over_speed_rpm."""
         return self._speed_reference_rpm
@@ -356,7 +356,7 @@ class Parameters(MutableMapping[str, float]):
         self.update({name: value})
 
     def update(self, *values: Any, **named: float) -> None:
-        """Sets several parameters in one piece; arguments as those of dict.update."""
+        """Sets several parameters in one piece; arguments as for dict.update."""
         wanted: dict[str, float] = dict(*values, **named)
         writes = {self.row(name).index: raw_value(self.row(name), value) for name, value in wanted.items()}
         if writes:
@@ -426,7 +426,7 @@ class Parameters(MutableMapping[str, float]):
 class LoggedFault:
     """A fault in the log of the drive. number counts from 1 and never begins again; start is the number of the start
     of the drive, time_s the time since then; checks are the names of all checks that failed in that tick; the values
-    are those of that tick, torque and speed of the period before."""
+    are from that tick, torque and speed from the period before."""
 
     number: int
     start: int
@@ -453,7 +453,7 @@ def _has_more_phases(session: Client) -> bool:
 
 
 def _self_tests() -> dict[int, str]:
-    """Names of the checks by their bits in the log: those of DRIVE_SELF_TEST, then the sensors of phases e and f."""
+    """Names of the checks by their bits in the log: DRIVE_SELF_TEST's, then the sensors of phases e and f."""
     signals = drive_database().get_message_by_name("DRIVE_SELF_TEST").signals
     more = [f"{part}_sensor_{phase}" for part in ("winding", "inverter") for phase in PHASES[FIRST_PHASES:]]
     return {signal.start: signal.name for signal in signals} | dict(enumerate(more, start=len(signals)))

@@ -64,7 +64,7 @@ def image(machine: str, build: str) -> Path:
 
 
 def deferred_instructions(instructions: Path) -> Path:
-    """The file with the instruction counts of the deferred interrupts, from that of the control interrupts."""
+    """The file with the instruction counts of the deferred interrupts, from the control interrupts' file."""
     return instructions.with_name(f"{instructions.name}.deferred")
 
 
@@ -110,7 +110,7 @@ def _built(build: str, name: str, builder: str) -> Path:
 def _build_custom(path: Path, key: str, build: str, phases: int) -> Path:
     """Builds the image for a user's machine file in a folder for its path and content, one process at a time. Of the
     sources only its tables are compiled: it links the firmware of the target build, of a machine of more than four
-    phases that of a build with room for six."""
+    phases the firmware of a build with room for six."""
     from salient.dbc import FIRST_PHASES, PHASES_MAX  # cantools, and here only
 
     if shutil.which("cmake") is None:

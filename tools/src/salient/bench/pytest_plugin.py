@@ -7,7 +7,7 @@
 
 `bench` is one drive with its test bench; `make_bench(**options)` starts any number of them, one after the other or (on
 local buses) simultaneously. The options are the fields of BenchConfig; control rate and sensors that a test does not
-state are those of [drive] of the machine file, as with `sim`. A test that fails, in its set-up, its call or its
+state come from [drive] of the machine file, as with `sim`. A test that fails, in its set-up, its call or its
 teardown, leaves a folder that the failure message names: logs, plots, true state, seed and replay command.
 
 Marks: `bench_each(machine=[...], controller=[...], target=[...])`, the test runs once for each combination, as with
@@ -194,7 +194,7 @@ def bench_choice(request: pytest.FixtureRequest) -> dict[str, str]:
 @pytest.fixture
 def make_bench(request: pytest.FixtureRequest, tmp_path: Path, bench_choice: dict[str, str]
                ) -> Iterator[Callable[..., Any]]:
-    """Starts benches: make_bench(machine=..., controller=..., seed=...). can: a bus other than that of the run."""
+    """Starts benches: make_bench(machine=..., controller=..., seed=...). can: a bus other than the run's."""
     state = request.node.stash.setdefault(_state_key, _State())
     bus = request.config.getoption("--salient-can")
     defaults = {"build": request.config.getoption("--salient-build"),

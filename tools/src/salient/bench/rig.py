@@ -1,6 +1,6 @@
 """The test bench over CAN: its variables, set now or at a virtual time.
 
-The names, units, ranges and descriptions of the bench variables are those of the signals of RIG_SET in rig.dbc.
+The names, units, ranges and descriptions of the bench variables come from the signals of RIG_SET in rig.dbc.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def _signals() -> dict[str, Signal]:
 
 @lru_cache
 def bench_variables() -> dict[str, Signal]:
-    """The bench variables by name, with unit and comment; the range is that of variable_range()."""
+    """The bench variables by name, with unit and comment; the range is variable_range()'s."""
     return {name: signal for name, signal in _signals().items() if "_coarse_" not in name}
 
 
 def _coarse(name: str) -> Signal | None:
-    """The signal that carries a variable beyond the range of that of its name."""
+    """The signal that carries a variable beyond the range of the signal with its name."""
     head, _, unit = name.partition("_Nm")
     return _signals().get(f"{head}_coarse_Nm{unit}")
 

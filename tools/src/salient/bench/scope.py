@@ -139,7 +139,7 @@ def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
 
 
 def write_table(trace: FaultTrace, path: Path) -> None:
-    """Comma-separated values, the last row that of the fault."""
+    """Comma-separated values, the last row at the fault."""
     _write_columns(columns(trace), path)
 
 

@@ -90,7 +90,7 @@ class Session(KnownAttributes):
     that reports another DBC no reference is sent (OtherDatabase). machine_option: how the user states the machine.
 
     node: the node number of the drive; drives: their number, with ascending node numbers from there: nodes. drive, rig,
-    telemetry and truth are those of the first; drives[1] and rigs[1] have their own telemetry and truth.
+    telemetry and truth are the first drive's; drives[1] and rigs[1] have their own telemetry and truth.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
     session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name, all
@@ -281,7 +281,7 @@ class Session(KnownAttributes):
         raise TimeoutError(f"no matching frame within {timeout_s:g} s")
 
     def require_drive_database(self) -> None:
-        """OtherDatabase when the drive has reported another DBC than that of the session. Waits for its first report
+        """OtherDatabase when the drive has reported another DBC than the session's. Waits for its first report
         where time moves by itself; in lock-step time belongs to the caller, and the report may come up to 100 ms later.
         """
         deadline_ns = self.time_ns + IDENTITY_WAIT_NS
@@ -351,7 +351,7 @@ class Session(KnownAttributes):
         return message
 
     def _check_identity(self, message: can.Message) -> None:
-        """One line on stderr, once, when the drive's DBC is not that of the session."""
+        """One line on stderr, once, when the drive's DBC is not the session's."""
         if self._other_database:
             return
         known = self._carrier.machine

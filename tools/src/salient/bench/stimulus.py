@@ -45,7 +45,7 @@ _SILENT_PERIODS = 3
 
 @dataclass(slots=True)
 class Stimulus:
-    """An act. time_s: virtual time of its effect; that of one that waits for its time may still come."""
+    """An act. time_s: virtual time of its effect; the time of one that still waits may be to come."""
 
     time_s: float
     text: str
@@ -56,7 +56,7 @@ class Stimulus:
 
 def stimuli_of(session: Session) -> list[Stimulus]:
     """The acts on the drives and test benches of a session until now, in the order of their effects: its own ones,
-    even those that are not on the bus yet, and those of other clients."""
+    even those that are not on the bus yet, and other clients'."""
     sent = Counter(_content(message) for _, message in session.sent)
     hosts = _messages_from(_HOST, session.machine, session.nodes)
     frames = list(session.sent)
@@ -325,7 +325,7 @@ class _Reader:
         if not waiting:
             return
         asked_ns, stimulus = waiting.popleft()
-        if str(values["status"]) != "done":  # it never had an effect: its time is that of the attempt
+        if str(values["status"]) != "done":  # it never had an effect: its time is the attempt's
             stimulus.time_s = asked_ns / 1e9
             stimulus.text += f" (refused: {values['status']})"
 

@@ -23,7 +23,7 @@ PROGRAM = TAB_PAGE / "target.mjs"
 _SIZE = struct.Struct("<I")
 _TIME_BYTES = 8
 _RECORD_BYTES = {16: 24, 72: 80}
-"""Bytes of a record by those of its frame."""
+"""Bytes of a record by the bytes of its frame."""
 _SEND_BUFFER_BYTES = 8 * 1024 * 1024
 _SO_SNDBUFFORCE = 32  # missing in Python's socket module
 _LENGTH_OFFSET = 12
