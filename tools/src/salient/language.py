@@ -3,13 +3,17 @@ exceptions by name, each with its reason, are in tools/spelling/language.toml.
 
 - A comment, a row of a table and an item of a list do not begin with "Of" or "What".
 - "none" follows "is" and "are" only after "there".
-- "that of" and "those of" do not open a comment, and are not written in documents: the noun is said.
+- "that of" and "those of" are not written in comments, docstrings and documents, nor across the end of a line: the noun
+  is said. The pages in docs/reference hold the rows of DBCs, parameters and help texts to it.
 - A sentence of a document has at most 30 words.
 """
 
 from __future__ import annotations
 
+import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -27,15 +31,49 @@ WORDS_MAX = 30
 _COMMENT = re.compile(r"""(?:/\*+|//|(?<!['"])#(?!["'])|\"\"\")\s?(?P<words>[A-Z]\w*(?: \w+)?)""")
 _CELL = re.compile(r"^(?:\| |[-*] |\d+\. )(?P<words>\w+(?: \w+)?)")
 _NONE = re.compile(r"(?<!there )\b(?:is|are) none\b")
-_THAT_OF = re.compile(r"\b(?:that|those) of\b", re.IGNORECASE)
+_THAT_OF = re.compile(r"\b(?:that|those)\s+of\b", re.IGNORECASE)
+_C_TOKEN = re.compile(r"""R"\([\s\S]*?\)"|"(?:\\.|[^"\\\n])*"|'(?:\\[^'\n]*|[^'\\\n])'"""
+                      r"""|(?P<comment>/\*[\s\S]*?\*/|//[^\n]*(?:\n[ \t]*//[^\n]*)*)""")
+_C_MARGIN = re.compile(r"^[ \t]*(?://+|\*(?!/))", re.MULTILINE)
 _OPENINGS = ("of", "what")
 
 
 def _opens_wrongly(words: str) -> bool:
-    return words.lower().split()[0] in _OPENINGS or _THAT_OF.fullmatch(words) is not None
+    return words.lower().split()[0] in _OPENINGS
 
 
-def _in_source(text: str) -> Iterator[tuple[int, str]]:
+def _that_of(text: str, first: int = 1) -> Iterator[tuple[int, str]]:
+    """first: number of the text's first line."""
+    yield from ((first + text.count("\n", 0, found.start()), f"'{' '.join(found[0].split())}'")
+                for found in _THAT_OF.finditer(text))
+
+
+def _c_comments(text: str) -> Iterator[tuple[int, str]]:
+    """Number of the first line, and text, of each comment without its margin; comments with // on successive lines are
+    one."""
+    for token in _C_TOKEN.finditer(text):
+        if token["comment"]:
+            yield 1 + text.count("\n", 0, token.start()), _C_MARGIN.sub("", token["comment"])
+
+
+def _python_comments(text: str) -> Iterator[tuple[int, str]]:
+    """Likewise of Python: docstrings of anything, and comments, on successive lines as one."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.lineno, node.value.value
+    first, lines = 0, list[str]()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            if token.start[0] != first + len(lines):
+                yield first, "\n".join(lines)
+                first, lines = token.start[0], []
+            lines.append(token.string.lstrip("#"))
+    yield first, "\n".join(lines)
+
+
+def _in_source(text: str, *, python: bool) -> Iterator[tuple[int, str]]:
+    for first, comment in (_python_comments if python else _c_comments)(text):
+        yield from _that_of(comment, first)
     for number, line in enumerate(text.splitlines(), 1):
         yield from ((number, f"begins with '{found['words']}'") for found in _COMMENT.finditer(line)
                     if _opens_wrongly(found["words"]))
@@ -48,8 +86,7 @@ def _in_document(text: str, *, generated: bool) -> Iterator[tuple[int, str]]:
         if found and _opens_wrongly(found["words"]):
             yield number, f"begins with '{found['words']}'"
         yield from ((number, f"'{found[0]}'") for found in _NONE.finditer(line))
-        if not generated:
-            yield from ((number, f"'{found[0]}'") for found in _THAT_OF.finditer(line))
+    yield from _that_of(text)
     if not generated:
         for number, sentence in sentences(text):
             words = len(sentence.split())
@@ -86,12 +123,12 @@ def _blocks(text: str) -> Iterator[tuple[int, str]]:
 def breaches(root: Path = ROOT) -> Iterator[tuple[str, int, str]]:
     """File, line and breach of a rule."""
     files = [path for folder in FOLDERS for path in (root / folder).rglob("*") if path.suffix in (*SOURCES, ".md")]
-    for path in sorted([*files, root / "README.md", root / "CONTRIBUTING.md"]):
+    for path in sorted([*files, *(root / f"{page}.md" for page in ("README", "CONTRIBUTING", "CHANGELOG"))]):
         name = str(path.relative_to(root))
         if path.is_file() and not name.startswith(NOT_OURS):
             text = path.read_text(encoding="utf-8")
             found = _in_document(text, generated=name.startswith(GENERATED)) if path.suffix == ".md" \
-                else _in_source(text)
+                else _in_source(text, python=path.suffix == ".py")
             yield from ((name, number, breach) for number, breach in found)
 
 

@@ -447,7 +447,7 @@ class Rig(_Rig):
     encoder_fault: float
     """0 to 2. Fault of the encoder: frozen repeats the last count, jump adds half a revolution to the angle."""
     interrupt_time_us: float
-    """0 to 10000 us. Execution time of the control interrupt, added to that of a target whose instructions take time; triggers that come during it are missed."""
+    """0 to 10000 us. Execution time of the control interrupt, added to the time of a target whose instructions take time; triggers that come during it are missed."""
     current_sensor_gain: float
     """0 to 10. Gain of every current sensor; 1 is exact."""
     truth_period_us: float

@@ -46,7 +46,7 @@ from salient.progress import Progress, steps_of
 KNOWN = ROOT / "tests" / "mutants.toml"
 SUMMARY = ROOT / "tests" / "mutants.json"
 TEST_MAX_S = 60
-"""Processor time of a program of tests, several times the slowest one's."""
+"""CPU time of a program of tests, several times the slowest one's."""
 KILLED, EQUIVALENT, INVALID, SURVIVED = "killed", "equivalent", "invalid", "survived"
 _WHOLE_DRIVE = "test_drive"
 
