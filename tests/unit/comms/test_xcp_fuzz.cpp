@@ -223,7 +223,12 @@ class XcpFuzz : public XcpBench {
             time_us += rarely(2) ? XCP_SILENT_US + 1 : 0x80000000u;
         }
         xcp_supervise(&xcp, rarely(5000), time_us);
-        unlocked = xcp.connected ? unlocked : 0;
+        if (!xcp.connected) {
+            unlocked = 0;
+        } else if (time_us - xcp.received_us > XCP_SILENT_US) {
+            ASSERT_TRUE(xcp.daq.running);
+            unlocked &= XCP_RESOURCE_DAQ;
+        }
     }
 
     std::mt19937 random{2026};
