@@ -12,7 +12,7 @@ import math
 import operator
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from salient.bench.client import LoggingClient
+from salient.bench.recording import Recording
 from salient.bench.variables import Quantity, Variables, short_names
 from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
 from salient.config import either
-from salient.errors import RunFailed, UsageError, close_names, shown
+from salient.errors import RunFailed, UsageError, shown
 
 if TYPE_CHECKING:
     from pyxcp.master.master import Master
@@ -99,30 +100,13 @@ def _raw(text: str, quantity: Quantity, expression: str) -> float:
     return value / quantity.factor
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Contents of the buffer. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of
-    the values of enumerations."""
-
-    time_s: np.ndarray
-    values: Mapping[str, np.ndarray]
-    units: Mapping[str, str]
-    names: Mapping[str, Mapping[int, str]]
-
-    def __getitem__(self, signal: str) -> np.ndarray:
-        if signal not in self.values:
-            raise KeyError(f"'{signal}' was not recorded; {close_names(signal, list(self.values))}")
-        return self.values[signal]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.values)
-
-
 class Scope:
-    """An armed buffer of a session's drive."""
+    """An armed buffer of a session's drive. recording: what the last read() has returned; title: its trigger."""
 
     def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], before: int, period_s: float,
-                 divider: int) -> None:
+                 divider: int, title: str) -> None:
+        self.recording: Recording | None = None
+        self.title = title
         self._session = session
         self._quantities = list(quantities)
         self._before, self._period_s, self._divider = before, period_s, divider
@@ -148,7 +132,8 @@ class Scope:
             master.setMta(variables.layout.bits("sampler.ring").start // 8)
             ring = np.frombuffer(bytes(master.fetch(_WORD_BYTES * words * capacity)), "<u4")
         records = np.roll(ring, -place).reshape(capacity, words)
-        return self._recording(records, self._before - missing, late)
+        self.recording = self._recording(records, self._before - missing, late)
+        return self.recording
 
     def _recording(self, records: np.ndarray, before: int, late: int) -> Recording:
         events = (np.arange(len(records)) - before) * self._divider + late
@@ -185,7 +170,7 @@ def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = No
         for number, quantity in enumerate(quantities):
             _write(master, "channel", quantity.variable.address // _WORD_BYTES * _WORD_BYTES, number)
         _write(master, "command", _COMMANDS["arm"])
-    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider)
+    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider, trigger or "at once")
 
 
 def _check(divider: Any, before: Any) -> None:
