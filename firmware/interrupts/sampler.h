@@ -26,8 +26,8 @@ typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
 #define SAMPLER_WORDS 4096u
 #endif
 
-/* In the deferred interrupt's results an event is the first control interrupt that finds a step complete, which the next
- * one has not begun to change. */
+/* In the deferred interrupt's results an event is the first control interrupt that finds a step complete, which the
+ * next one has not begun to change. */
 typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_BACKGROUND, SAMPLER_EVENT_DEFERRED } sampler_event_t;
 
 /* Bit of the events that the control interrupt has: one test for both. */

@@ -82,7 +82,7 @@ class Mf4Log(DecodedLog):
                             comment=definition.comment or "")
 
 
-def names_conversion(names: Mapping[int, str]) -> dict[str, object]:
+def names_conversion(names: Mapping[int, str] | Mapping[float, str]) -> dict[str, object]:
     """asammdf's conversion of numbers to names."""
     conversion: dict[str, object] = {"default": b""}
     for index, (number, text) in enumerate(names.items()):
