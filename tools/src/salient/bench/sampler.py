@@ -12,7 +12,8 @@ import math
 import operator
 import re
 import struct
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -119,21 +120,42 @@ class Scope:
     def read(self, timeout: float = TIMEOUT_S) -> Recording:
         """Lets time pass until the buffer is complete, and reads it. ScopeError: it is not within `timeout` seconds of
         virtual time; it stays armed."""
-        variables = variables_of(self._session)
         deadline_ns = self._session.time_ns + round(1e9 * timeout)
         with connected(self._session) as master:
-            while _member(master, variables, "sampler.state") != _state(variables, "SAMPLER_COMPLETE"):
+            while not self._is_complete(master):
                 if self._session.time_ns >= deadline_ns:
                     raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
                 self._session.run_for(_POLL_S)
-            words, capacity, place, missing, late = (
+        *_, self.recording = self.parts()
+        return self.recording
+
+    def is_complete(self) -> bool:
+        """The buffer is to be read."""
+        with connected(self._session) as master:
+            return self._is_complete(master)
+
+    def parts(self, words: int = sys.maxsize) -> Iterator[Recording | None]:
+        """Reads a complete buffer, with what else the caller does between two parts of so many words: None after each,
+        at last the recording."""
+        variables = variables_of(self._session)
+        with connected(self._session) as master:
+            record_words, capacity, place, missing, late = (
                 _member(master, variables, f"sampler.{name}")
                 for name in ("record_words", "capacity", "place", "missing", "trigger_events"))
-            master.setMta(variables.layout.bits("sampler.ring").start // 8)
-            ring = np.frombuffer(bytes(master.fetch(_WORD_BYTES * words * capacity)), "<u4")
-        records = np.roll(ring, -place).reshape(capacity, words)
+        begin, end = variables.layout.bits("sampler.ring").start // 8, _WORD_BYTES * record_words * capacity
+        read = bytearray()
+        while len(read) < end:
+            with connected(self._session) as master:
+                master.setMta(begin + len(read))
+                read += bytes(master.fetch(min(_WORD_BYTES * words, end - len(read))))
+            yield None
+        records = np.roll(np.frombuffer(read, "<u4"), -place).reshape(capacity, record_words)
         self.recording = self._recording(records, self._before - missing, late)
-        return self.recording
+        yield self.recording
+
+    def _is_complete(self, master: Master) -> bool:
+        variables = variables_of(self._session)
+        return _member(master, variables, "sampler.state") == _state(variables, "SAMPLER_COMPLETE")
 
     def _recording(self, records: np.ndarray, before: int, late: int) -> Recording:
         events = (np.arange(len(records)) - before) * self._divider + late
