@@ -135,7 +135,7 @@ class Recording {
                 return [low - margin, high + margin];
             } } },
             axes: [{ size: 26, space: 80, font: FONT, values: (_, ticks) => ticks.map((tick) => `${short(tick)} ${this.unit}`) },
-                   { size: signal.choices ? 90 : 58, space: 22, font: FONT, values: (_, ticks) => names(ticks),
+                   { size: this.shown.some((each) => each.choices) ? 90 : 58, space: 22, font: FONT, values: (_, ticks) => names(ticks),
                      ...(signal.choices ? { incrs: [1, 2, 5] } : {}) }],
             cursor: { sync: { key: "recording" }, points: { show: false }, drag: { x: true, y: false } },
             series: [{}, { stroke: colour, width: 1.5, points: { show: false },
