@@ -288,8 +288,11 @@ bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp
 }
 
 void xcp_supervise(xcp_t *xcp, bool bus_off, uint32_t time_us) {
-    if (xcp->connected && (bus_off || time_us - xcp->received_us > XCP_SILENT_US)) {
+    const bool silent = time_us - xcp->received_us > XCP_SILENT_US;
+    if (xcp->connected && (bus_off || (silent && !xcp->daq.running))) {
         end_session(xcp);
+    } else if (silent) { /* a master that measures sends nothing else */
+        xcp->unlocked &= XCP_RESOURCE_DAQ;
     }
     if (time_us - xcp->seed_us > XCP_SILENT_US) { /* its age is known modulo 2^32 us only */
         xcp->seed = 0;

@@ -16,12 +16,12 @@
  * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as the key of the
  * arming: a random or recorded frame opens nothing. A seed serves one attempt within ARMING_RESPONSE_MAX_US. Both are
  * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a
- * command.
+ * command. While it measures, a master sends none: that long, and only CAL/PAG is locked.
  *
  * A write of a parameter is a set of one (parameter_set.h): staged, checked as any other, and applied or refused. It
  * is refused while another set is staged. In a run tunable parameters only. SET_REQUEST STORE_CAL stores.
  *
- * Measuring: one DAQ list, of a choice of two events, of at most SAMPLER_CHANNELS_MAX entries within single words.
+ * Measuring: one DAQ list, of a choice of three events, of at most SAMPLER_CHANNELS_MAX entries within single words.
  * Records that the bus does not take are lost, and counted (drive_t.sampler.lost); the time in the first frame of a
  * record shows them. DAQ frames have the lowest priority of the drive but for two, and only one of them is in a
  * mailbox.
@@ -40,7 +40,7 @@
 
 #define XCP_SILENT_US 10000000u
 #define XCP_ODTS_MAX SAMPLER_CHANNELS_MAX
-#define XCP_EVENTS 2u /* of sampler_event_t */
+#define XCP_EVENTS 3u /* of sampler_event_t */
 #define XCP_TEXT_BYTES 32u
 
 #define XCP_AREA 0xF0000000u /* bits of an address that select the area */

@@ -128,8 +128,9 @@ void drive_control_interrupt(drive_t *drive, hal_t *hal) {
     if (drive->control.deferred_request.skipped == 0) {
         hal_interrupt_request_deferred(hal);
     }
-    if (drive->sampler.event == SAMPLER_EVENT_CONTROL) {
-        sampler_record(&drive->sampler, drive, DRIVE_WORDS, sample.time_us);
+    if ((drive->sampler.event & SAMPLER_IN_CONTROL) != 0) {
+        sampler_record_control(&drive->sampler, drive, DRIVE_WORDS, sample.time_us,
+                               drive->control.deferred.response.completed);
     }
     drive->used_ticks = hal_interrupt_elapsed_ticks(hal);
     if (drive->used_ticks > drive->worst_ticks) {

@@ -61,7 +61,8 @@ static void measure_phases(const control_parameters_t *parameters, const control
     for (unsigned phase = 0; phase < phases; phase++) {
         const int32_t current_q9 = scale_counts(sample->adc->phase_current_counts[phase], scale_q18);
         measured->current_q9[phase] = current_q9;
-        max_q9 = fixed_max(current_q9, max_q9);
+        /* No current is below 0. */
+        max_q9 = phase == 0 ? current_q9 : fixed_max(current_q9, max_q9);
         applied_flux_step(&state->applied_flux, &period, phase, state->duty_q15[phase], current_q9);
     }
     measured->current_max_q9 = max_q9;

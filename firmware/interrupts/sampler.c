@@ -102,6 +102,17 @@ NOINLINE void sampler_record(sampler_t *sampler, const void *memory, uint32_t wo
     }
 }
 
+NOINLINE void sampler_record_control(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us,
+                                     uint32_t deferred_steps) {
+    if (sampler->event == SAMPLER_EVENT_DEFERRED) {
+        if (sampler->step == deferred_steps) {
+            return;
+        }
+        sampler->step = deferred_steps;
+    }
+    sampler_record(sampler, memory, words, time_us);
+}
+
 COLD void sampler_stop(sampler_t *sampler) {
     *(volatile uint32_t *)&sampler->event = 0;
     MEMORY_ORDER(); /* the interrupt leaves the rest alone from here on */
@@ -116,7 +127,7 @@ COLD static bool valid(const sampler_setup_t *setup, uint32_t words) {
         within = within && setup->word[i] < words;
     }
     return within && setup->channels >= 1u && setup->channels <= SAMPLER_CHANNELS_MAX &&
-           setup->event >= SAMPLER_EVENT_CONTROL && setup->event <= SAMPLER_EVENT_BACKGROUND && setup->divider >= 1u &&
+           setup->event >= SAMPLER_EVENT_CONTROL && setup->event <= SAMPLER_EVENT_DEFERRED && setup->divider >= 1u &&
            setup->condition < SAMPLER_CONDITIONS && setup->variable.left <= 31u && setup->variable.right <= 31u;
 }
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import sys
+
 import numpy as np
 import pytest
+from asammdf import MDF
 
+from salient.bench import failure
 from salient.bench.sampler import ScopeError, parse_trigger
 from salient.bench.variables import SIGNALS, Variables
 from salient.errors import UsageError
+from salient.paths import ROOT
 
 PERIOD_S = 25e-6
 CURRENT_LSB_A = 100.0 / 4096.0
 COUNT_DEG = 360.0 / 2**17
+PAGE = (ROOT / "docs" / "can" / "scope.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"```python\n(def (test_\w+)\(.*?)```", PAGE, re.DOTALL))
 FOUR = ["encoder_angle_deg", "current_a_A", "current_b_A", "current_c_A"]
 
 
@@ -175,3 +183,99 @@ def test_every_short_name_is_a_variable_with_the_unit_that_it_has():
 ])
 def test_level_of_a_trigger_is_the_raw_value_that_the_comparison_means(text, level):
     assert parse_trigger(text, Variables(machine="saturating")).level == level
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=EXAMPLES.values())
+def test_example_of_the_page_passes(bench, example):
+    namespace = {"np": np}
+    exec(example, namespace)
+    namespace[EXAMPLES[example]](bench)
+
+
+@pytest.mark.parametrize("phase", "abc")
+@pytest.mark.parametrize("gain", [None, 0.98, 1.02])
+def test_ratio_of_current_and_applied_flux_linkage_names_a_sensor_that_is_2_percent_off(make_bench, phase, gain):
+    bench = make_bench()
+    if gain is not None:
+        bench.fault("current_sensor_gain", phase=phase, gain=gain)
+    running(bench)
+    bench.load_torque_Nm = 5
+    bench.run_for(0.5)
+    flux = [f"control.applied_flux.at_sample_q29[{number}]" for number in range(3)]
+    current = [f"current_{name}_A" for name in "abc"]
+    recording = bench.scope(["encoder_angle_deg", *flux, *current], divider=16).read()
+    angle_deg = np.unwrap(recording["encoder_angle_deg"], period=360)
+    revolution = angle_deg - angle_deg[0] < 360
+    ratio = [recording[i][revolution].sum() / recording[psi][revolution].sum()
+             for i, psi in zip(current, flux, strict=True)]
+    deviation = ratio / np.median(ratio) - 1
+    if gain is None:
+        assert np.max(np.abs(deviation)) < 0.001
+        return
+    at = "abc".index(phase)
+    assert 0.009 < deviation[at] * np.sign(gain - 1.0) < 0.02
+    assert np.max(np.abs(np.delete(deviation, at))) < 0.5 * abs(deviation[at])
+
+
+@pytest.mark.parametrize("ending", [".csv", ".mf4", ".parquet"])
+def test_recording_is_written_for_other_tools(bench, tmp_path, ending):
+    running(bench)
+    scope = bench.scope(["state", "torque_reference_Nm"], trigger="torque_reference_Nm > 5", before=0.5)
+    bench.load_torque_Nm = 8
+    recording = scope.read()
+    path = tmp_path / f"recording{ending}"
+    parquet = pytest.importorskip("pyarrow.parquet") if ending == ".parquet" else None
+    recording.write(path)
+    if ending == ".csv":
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        columns = {name: table[name] for name in table.dtype.names}
+    elif parquet is not None:
+        table = parquet.read_table(path)
+        assert table.schema.field("torque_reference_Nm").metadata == {b"unit": b"N m"}
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+    else:
+        with MDF(path) as file:
+            assert file.get("torque_reference_Nm").unit == "N m"
+            assert set(file.get("state").samples) == {b"DRIVE_STATE_RUN"}
+            columns = {name: file.get(name, raw=True).samples for name in recording}
+            columns["time_s"] = file.get("state").timestamps
+    for name, values in recording.columns.items():
+        assert columns[name] == pytest.approx(values, rel=1e-8, abs=1e-12), name
+
+
+def test_parquet_names_the_package_that_it_requires(bench, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UsageError, match=r"x\.parquet: Parquet requires the Python package pyarrow"):
+        bench.scope(["state"]).read().write(tmp_path / "x.parquet")
+    assert not (tmp_path / "x.parquet").exists()
+
+
+def test_recording_of_another_ending_is_refused(bench, tmp_path):
+    recording = bench.scope(["state"]).read()
+    with pytest.raises(UsageError, match=r"x\.xlsx: must end with \.csv, \.mf4 or \.parquet"):
+        recording.write(tmp_path / "x.xlsx")
+    assert not (tmp_path / "x.xlsx").exists()
+
+
+def test_failure_report_has_what_the_buffer_has_and_leaves_out_what_is_not_complete(bench, tmp_path):
+    running(bench)
+    read = bench.scope(["torque_reference_Nm"], trigger="torque_reference_Nm > 5")
+    bench.load_torque_Nm = 8
+    recording = read.read()
+    bench.scope(["state", "current_a_A"], trigger="state == fault", divider=4)
+    failure.save(bench, tmp_path / "waits", {"replay": ""}, None)
+    names = {path.name for path in (tmp_path / "waits").glob("scope_*")}
+    assert names == {"scope_0.csv", "scope_0.png"}
+    table = np.genfromtxt(tmp_path / "waits" / "scope_0.csv", delimiter=",", names=True)
+    assert len(table) == len(recording.time_s)
+    bench.run_for(0.3)
+    bench.fault("winding_open", phase="b")
+    bench.run_until(lambda: bench.drive.state == "fault", timeout=0.5)
+    bench.run_for(0.4)
+    failure.save(bench, tmp_path / "complete", {"replay": ""}, None)
+    names = {path.name for path in (tmp_path / "complete").glob("scope_*")}
+    assert names == {"scope_0.csv", "scope_0.png", "scope_1.csv", "scope_1.png"}
+    page = (tmp_path / "complete" / "failure.html").read_text(encoding="utf-8")
+    assert "triggered by: state == fault" in page
+    failure.clear(tmp_path / "complete")
+    assert not list((tmp_path / "complete").iterdir())

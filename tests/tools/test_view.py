@@ -603,6 +603,75 @@ def test_the_page_decodes_every_signal_as_cantools_does(live):
             assert found[name] == pytest.approx(value, rel=1e-12, nan_ok=True), name
 
 
+def test_buffer_of_the_drive_is_armed_read_and_shown_with_cursors_and_spectrum(live):
+    visitor = live()
+    page, bench = visitor.page, visitor.bench
+    visitor.take_command()
+    page.fill("#speed-reference", "300")
+    visitor.press("#speed-form button")
+    visitor.run(0.3)
+    visitor.tab("Scope")
+    page.fill("#scope-signals", "torque_reference_Nm, state current_a_A")
+    assert "dc_link_voltage_V" in (visitor.finish() or page.inner_text("#scope-names"))
+    page.fill("#scope-trigger", "torque_reference_Nm >> 5")
+    visitor.press("#scope-form button")
+    assert "trigger 'torque_reference_Nm >> 5': must be" in visitor.notice()
+    page.fill("#scope-trigger", "torque_reference_Nm > 5")
+    visitor.press("#scope-form button")
+    visitor.run(0.1)
+    assert "Waits" in page.inner_text("#scope-state") and not page.is_visible("#recording")
+    assert nothing_is_cut_off(page) == []
+    bench.load_torque_Nm = 8
+    for _ in range(2000):
+        bench.run_for(0.005)
+        visitor.catch_up()
+        if page.is_visible("#recording"):
+            break
+    assert page.inner_text("#recording-title") == "The drive's buffer: torque_reference_Nm > 5"
+    assert visitor.ask("document.querySelectorAll('#recording .uplot').length") == 3
+    assert page.is_enabled("#stop")
+    plots = page.query_selector_all("#recording .u-over")
+    for part in (0.2, 0.8):
+        box = plots[0].bounding_box()
+        page.mouse.click(box["x"] + part * box["width"], box["y"] + box["height"] / 2)
+    rows = [[cell.inner_text() for cell in row.query_selector_all("th, td")]
+            for row in page.query_selector_all("#recording-cursors tbody tr")]
+    assert [row[0] for row in rows] == ["time, ms", "torque_reference_Nm, N m", "state", "current_a_A, A"]
+    at_ms = [float(text.replace("−", "-")) for text in rows[0][1:]]
+    assert at_ms[0] < 0 < at_ms[1] and at_ms[2] == pytest.approx(at_ms[1] - at_ms[0], abs=1e-3)
+    torque_Nm = [float(text.replace("−", "-")) for text in rows[1][1:]]
+    assert torque_Nm[0] <= 5 < torque_Nm[1] and rows[2][1:] == ["run", "run", "–"]
+    assert nothing_is_cut_off(page) == []
+    page.screenshot(path=picture("scope"))
+    page.click("#recording-spectrum")
+    assert visitor.ask("document.querySelectorAll('#recording .uplot').length") == 2
+    page.screenshot(path=picture("spectrum"))
+    page.keyboard.press("Escape")
+    visitor.run(0.3)
+    assert bench.drive.state == "ready"
+    page.click("#recording-close")
+    assert not page.is_visible("#recording") and visitor.errors == []
+
+
+def test_spectrum_has_the_amplitudes_of_sines(live):
+    visitor = live()
+    random_ = np.random.default_rng(5)
+    for size in (2, 3, 64, 585, 1024):
+        values = random_.normal(size=size)
+        found = visitor.page.evaluate("async ([values, step]) => (await import('/scope.js')).spectrum(values, step)",
+                                      [values.tolist(), 1e-4])
+        used = 2 ** int(math.log2(size))
+        part = values[:used] - np.mean(values[:used])
+        lines = np.abs(np.fft.rfft(part * (1 - np.cos(2 * np.pi * np.arange(used) / used)))) / used
+        lines[1:-1] *= 2
+        assert found["amplitude"] == pytest.approx(lines, abs=1e-12)
+        assert found["frequency_Hz"] == pytest.approx(np.fft.rfftfreq(used, 1e-4))
+    time_s = np.arange(1024) * 1e-4
+    sine = 3 + 2 * np.sin(2 * np.pi * 16 / 0.1024 * time_s)
+    found = visitor.page.evaluate("async (values) => (await import('/scope.js')).spectrum(values, 1e-4)", sine.tolist())
+    assert max(found["amplitude"]) == pytest.approx(2, rel=1e-9)
+
+
 @pytest.mark.in_turns
 def test_the_commands_of_the_server_are_those_of_the_interface(live):
     visitor = live()

@@ -134,14 +134,14 @@ TEST_F(Xcp, identifies_program_and_events_by_texts) {
     for (const unsigned type : {2, 3, 4, 6, 128, 255}) {
         EXPECT_EQ(send({0xFA, uint8_t(type)}), (bytes_t{0xFF, 0, 0, 0, 0, 0, 0, 0})) << "there is none";
     }
-    const char *names[] = {"control", "background"};
-    for (unsigned event = 0; event < 2; event++) {
+    const char *names[] = {"control", "background", "deferred"};
+    for (unsigned event = 0; event < XCP_EVENTS; event++) {
         const std::string name = names[event];
         EXPECT_EQ(send({0xD7, 0, uint8_t(event), 0}), (bytes_t{0xFF, 0x04, 1, uint8_t(name.size()), 0, 0, 0}));
         const bytes_t text = upload(unsigned(name.size()));
         EXPECT_EQ(std::string(text.begin(), text.end()), name);
     }
-    EXPECT_EQ(send({0xD7, 0, 2, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
+    EXPECT_EQ(send({0xD7, 0, XCP_EVENTS, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(send({0xD7, 0, 0, 1}), failed(XCP_ERROR_OUT_OF_RANGE));
 }
 
@@ -231,16 +231,35 @@ TEST_F(Xcp, the_end_of_a_session_locks_and_stops_measuring) {
     xcp_supervise(&xcp, true, time_us);
     expect_ended();
     time_us = 0xFFFFFF00u;
-    begin();
+    open();
     xcp_supervise(&xcp, false, time_us + XCP_SILENT_US);
-    EXPECT_TRUE(xcp.connected && xcp.daq.running);
+    EXPECT_TRUE(xcp.connected);
     time_us += XCP_SILENT_US;
     EXPECT_FALSE(send({0xFD}).empty()); // no silence
     xcp_supervise(&xcp, false, time_us + XCP_SILENT_US);
-    EXPECT_TRUE(xcp.connected && xcp.daq.running);
+    EXPECT_TRUE(xcp.connected);
     xcp_supervise(&xcp, false, time_us + XCP_SILENT_US + 1);
     expect_ended();
     EXPECT_EQ(next_frame(), bytes_t{});
+}
+
+TEST_F(Xcp, a_silent_master_goes_on_measuring_and_writes_no_parameter) {
+    time_us = 0xFFFFFF00u;
+    open();
+    measure();
+    const bytes_t key_needed = failed(XCP_ERROR_ACCESS_LOCKED);
+    for (unsigned k = 0; k <= 500; k++) { // 83 minutes in all
+        xcp_supervise(&xcp, false, time_us + XCP_SILENT_US);
+        ASSERT_EQ(xcp.unlocked, k == 0 ? XCP_RESOURCE_DAQ | XCP_RESOURCE_CALIBRATION : XCP_RESOURCE_DAQ);
+        time_us += XCP_SILENT_US + 1;
+        xcp_supervise(&xcp, false, time_us);
+        ASSERT_TRUE(xcp.connected && xcp.daq.running);
+        ASSERT_EQ(xcp.unlocked, XCP_RESOURCE_DAQ);
+    }
+    EXPECT_EQ(write_parameter(0, drive->parameters.values[0]), key_needed);
+    EXPECT_EQ(send({0xDE, 0, 0, 0}), (bytes_t{0xFF, 0}));
+    xcp_supervise(&xcp, false, time_us + XCP_SILENT_US + 1);
+    expect_ended();
 }
 
 TEST_F(Xcp, every_write_and_every_command_of_a_measurement_is_refused_while_locked) {

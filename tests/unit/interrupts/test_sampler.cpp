@@ -64,7 +64,7 @@ sampler_setup_t any_setup(std::mt19937 &random, const part_t &part, int64_t leve
     for (unsigned i = 0; i < setup.channels; i++) {
         setup.word[i] = uint16_t(random() % WORDS);
     }
-    setup.event = sampler_event_t(1 + random() % 2);
+    setup.event = sampler_event_t(1 + random() % 3);
     setup.divider = uint16_t(random() % 3 == 0 ? 1 : 1 + random() % 5);
     const unsigned most = SAMPLER_WORDS / setup.channels - 2;
     const unsigned kind = random() % 4;
@@ -224,6 +224,26 @@ TEST(SamplerBuffer, triggers_at_the_event_of_the_reference_and_keeps_what_surrou
     for (const unsigned count : of_condition) {
         EXPECT_GT(count, 50u);
     }
+}
+
+TEST_F(Sampler, records_each_deferred_step_once_at_the_first_control_interrupt_after_its_end) {
+    std::mt19937 random(3);
+    for (const bool deferred : {true, false}) {
+        sampler_setup_t setup = plain();
+        setup.event = deferred ? SAMPLER_EVENT_DEFERRED : SAMPLER_EVENT_CONTROL;
+        EXPECT_TRUE((setup.event & SAMPLER_IN_CONTROL) != 0);
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
+        uint32_t steps = UINT32_MAX - 100, recorded = steps;
+        sampler.step = steps;
+        for (uint32_t k = 0; k < 1000; k++) {
+            steps += random() % 2; // some take longer than a period
+            const uint32_t written = sampler.written;
+            sampler_record_control(&sampler, memory.data(), WORDS, k, steps);
+            ASSERT_EQ(sampler.written - written, deferred ? steps - recorded : 1);
+            recorded = steps;
+        }
+    }
+    EXPECT_EQ(SAMPLER_EVENT_BACKGROUND & SAMPLER_IN_CONTROL, 0u);
 }
 
 TEST_F(Sampler, compares_an_unsigned_word_with_a_level_of_its_kind) {

@@ -276,8 +276,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     scope.add_argument("--timeout", type=_positive, default=10.0, metavar="S",
                        help="time to wait for the trigger (default %(default)s)")
     scope.add_argument("--list", action="store_true", help="instead: list the short names, and the variables")
-    scope.add_argument("--out", type=Path, default=OUT / "scope", metavar="DIR",
-                       help="folder (default %(default)s)")
+    scope.add_argument("--out", type=Path, default=OUT / "scope", metavar="DIR|FILE",
+                       help="folder (default %(default)s); with --signals also a file .csv, .mf4 or .parquet")
     _add_machine(scope)
     _add_node(scope)
     _add_databases(scope, "whose signals while the buffer is read are a table, too, and whose messages are watched")

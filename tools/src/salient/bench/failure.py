@@ -6,25 +6,25 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from salient.bench.recording import COLOURS
 from salient.bench.session import Session
 from salient.bench.stimulus import STIMULI, Stimulus, last_before, stimuli_of
 from salient.bus.log import write_logs
 from salient.config import BenchConfig
 from salient.dbc import PHASES, PHASES_MIN
+from salient.errors import RunFailed
 from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
 """Length of a plot and of the list of changes, around their moment."""
 TRUTH_S = 1.0
-COLOURS = ("#0072b2", "#d55e00", "#000000", "#56b4e9", "#7711dd", "#996655")
-"""Colours of the live page (view/page/palette.js)."""
 _OF_MORE_PHASES = tuple(f"current_{phase}_A" for phase in PHASES[PHASES_MIN:])
 TRUTH = "truth.npy"
 LEFT = ("can.blf", "can.log", "failure.png", "last_second.png", "first_fault.png", "bench.json", "failure.html", TRUTH)
@@ -82,22 +82,39 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
     (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    _write_page(folder, about | {"error": error, STIMULI: [str(stimulus) for stimulus in acts]}, title)
+    scopes = _save_scopes(session, folder)
+    _write_page(folder, about | {"error": error, STIMULI: [str(stimulus) for stimulus in acts]}, title, scopes)
     return Saved(last, drive, [str(stimulus) for stimulus in acts], changed)
 
 
 def clear(folder: Path) -> None:
     """Removes what an earlier failure has left: it would be taken for a part of the next one."""
-    for name in LEFT:
-        (folder / name).unlink(missing_ok=True)
+    for path in (*(folder / name for name in LEFT), *folder.glob("scope_[0-9]*")):
+        path.unlink(missing_ok=True)
 
 
-def _write_page(folder: Path, about: dict[str, Any], title: str) -> None:
+def _save_scopes(session: Session, folder: Path) -> dict[str, str]:
+    """Table and plot of each recording of the drive's buffer, whether or not the test has come to read it; titles by
+    name of the plot. Time passes while it is read."""
+    titles = {}
+    for number, scope in enumerate(session.scopes):
+        try:
+            recording = scope.recording or scope.read(timeout=0.0)
+        except (RunFailed, OSError):
+            continue  # not complete, armed anew, or the drive has ended
+        name = f"scope_{number}.png"
+        recording.write(folder / f"scope_{number}.csv")
+        recording.plot(folder / name, scope.title)
+        titles[name] = f"The drive's buffer, triggered by: {scope.title}"
+    return titles
+
+
+def _write_page(folder: Path, about: dict[str, Any], title: str, scopes: Mapping[str, str]) -> None:
     from salient.pages import Plot, write_page
 
     plots = [Plot("", title, (folder / name).read_bytes())
-             for name, title in (("failure.png", f"The {title}"), ("first_fault.png", "The first fault"),
-                                ("last_second.png", "The second before"))
+             for name, title in (("failure.png", f"The {title}"), *scopes.items(),
+                                ("first_fault.png", "The first fault"), ("last_second.png", "The second before"))
              if (folder / name).exists()]
     # The first ones of a drive that is on the bus already, the last ones of a failure outside pytest.
     unknown = dict.fromkeys(("simulator", "stderr", "machine", "seed", "test", "phase", "replay_in", "world"), "")

@@ -12,7 +12,8 @@ import math
 import operator
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -20,10 +21,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from salient.bench.client import LoggingClient
+from salient.bench.recording import Recording
 from salient.bench.variables import Quantity, Variables, short_names
 from salient.bench.xcp import AREA_SCOPE, AREA_TEXT, connected
 from salient.config import either
-from salient.errors import RunFailed, UsageError, close_names, shown
+from salient.errors import RunFailed, UsageError, shown
 
 if TYPE_CHECKING:
     from pyxcp.master.master import Master
@@ -99,30 +101,13 @@ def _raw(text: str, quantity: Quantity, expression: str) -> float:
     return value / quantity.factor
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Contents of the buffer. time_s: from the trigger on, whose event is 0; values: by signal, in its unit; names: of
-    the values of enumerations."""
-
-    time_s: np.ndarray
-    values: Mapping[str, np.ndarray]
-    units: Mapping[str, str]
-    names: Mapping[str, Mapping[int, str]]
-
-    def __getitem__(self, signal: str) -> np.ndarray:
-        if signal not in self.values:
-            raise KeyError(f"'{signal}' was not recorded; {close_names(signal, list(self.values))}")
-        return self.values[signal]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.values)
-
-
 class Scope:
-    """An armed buffer of a session's drive."""
+    """An armed buffer of a session's drive. recording: what the last read() has returned; title: its trigger."""
 
     def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], before: int, period_s: float,
-                 divider: int) -> None:
+                 divider: int, title: str) -> None:
+        self.recording: Recording | None = None
+        self.title = title
         self._session = session
         self._quantities = list(quantities)
         self._before, self._period_s, self._divider = before, period_s, divider
@@ -135,20 +120,42 @@ class Scope:
     def read(self, timeout: float = TIMEOUT_S) -> Recording:
         """Lets time pass until the buffer is complete, and reads it. ScopeError: it is not within `timeout` seconds of
         virtual time; it stays armed."""
-        variables = variables_of(self._session)
         deadline_ns = self._session.time_ns + round(1e9 * timeout)
         with connected(self._session) as master:
-            while _member(master, variables, "sampler.state") != _state(variables, "SAMPLER_COMPLETE"):
+            while not self._is_complete(master):
                 if self._session.time_ns >= deadline_ns:
                     raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
                 self._session.run_for(_POLL_S)
-            words, capacity, place, missing, late = (
+        *_, self.recording = self.parts()
+        return self.recording
+
+    def is_complete(self) -> bool:
+        """The buffer is to be read."""
+        with connected(self._session) as master:
+            return self._is_complete(master)
+
+    def parts(self, words: int = sys.maxsize) -> Iterator[Recording | None]:
+        """Reads a complete buffer, with what else the caller does between two parts of so many words: None after each,
+        at last the recording."""
+        variables = variables_of(self._session)
+        with connected(self._session) as master:
+            record_words, capacity, place, missing, late = (
                 _member(master, variables, f"sampler.{name}")
                 for name in ("record_words", "capacity", "place", "missing", "trigger_events"))
-            master.setMta(variables.layout.bits("sampler.ring").start // 8)
-            ring = np.frombuffer(bytes(master.fetch(_WORD_BYTES * words * capacity)), "<u4")
-        records = np.roll(ring, -place).reshape(capacity, words)
-        return self._recording(records, self._before - missing, late)
+        begin, end = variables.layout.bits("sampler.ring").start // 8, _WORD_BYTES * record_words * capacity
+        read = bytearray()
+        while len(read) < end:
+            with connected(self._session) as master:
+                master.setMta(begin + len(read))
+                read += bytes(master.fetch(min(_WORD_BYTES * words, end - len(read))))
+            yield None
+        records = np.roll(np.frombuffer(read, "<u4"), -place).reshape(capacity, record_words)
+        self.recording = self._recording(records, self._before - missing, late)
+        yield self.recording
+
+    def _is_complete(self, master: Master) -> bool:
+        variables = variables_of(self._session)
+        return _member(master, variables, "sampler.state") == _state(variables, "SAMPLER_COMPLETE")
 
     def _recording(self, records: np.ndarray, before: int, late: int) -> Recording:
         events = (np.arange(len(records)) - before) * self._divider + late
@@ -185,7 +192,7 @@ def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = No
         for number, quantity in enumerate(quantities):
             _write(master, "channel", quantity.variable.address // _WORD_BYTES * _WORD_BYTES, number)
         _write(master, "command", _COMMANDS["arm"])
-    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider)
+    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider, trigger or "at once")
 
 
 def _check(divider: Any, before: Any) -> None:

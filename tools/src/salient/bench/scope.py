@@ -6,10 +6,8 @@ the buffer is read."""
 from __future__ import annotations
 
 import argparse
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -17,16 +15,17 @@ from cantools.database.can import Database
 
 from salient.bench import sampler
 from salient.bench.drive import FaultTrace
-from salient.bench.failure import COLOURS
+from salient.bench.recording import COLOURS, FORMATS, label_axes, write_columns
 from salient.bench.session import SILENCE_MAX_S, Session
 from salient.bench.variables import SIGNALS as SHORT_NAMES
-from salient.bench.variables import Variables, short_names
+from salient.bench.variables import Variables
 from salient.bus.databases import load_databases, messages_of
 from salient.bus.frame_bits import BitRates
 from salient.bus.log import open_log
 from salient.bus.traffic import MISSING_CYCLES, Traffic
 from salient.bus.traffic_text import report_lines
 from salient.dbc import PHASES
+from salient.errors import UsageError
 from salient.paths import make_folder
 
 TABLE, PLOT, SIGNALS = "scope.csv", "scope.png", "signals.csv"
@@ -38,11 +37,13 @@ _MS_PER_S, _PERCENT = 1000.0, 100.0
 def run(options: argparse.Namespace) -> int:
     """Reads the buffer of a running drive into a folder; returns the exit code. dbc: databases of other nodes; with
     them the signals of the bus meanwhile are a table, too, and its traffic is printed. UsageError: see
-    load_databases."""
+    load_databases; without signals a file instead of a folder."""
     if options.list:
         return _list(options.machine)
     if options.signals:
         return _record(options)
+    if options.out.suffix in FORMATS:
+        raise UsageError(f"--out {options.out}: without --signals it is a folder")
     others = load_databases(options.dbc, options.node)
     make_folder(options.out, [TABLE, PLOT, *([SIGNALS] if others else [])])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
@@ -70,38 +71,20 @@ def _list(machine: str | None) -> int:
 
 def _record(options: argparse.Namespace) -> int:
     """UsageError: see sampler.arm; ScopeError: the trigger has not come."""
-    make_folder(options.out, [TABLE, PLOT])
+    is_file = options.out.suffix in FORMATS
+    table = options.out if is_file else options.out / TABLE
+    pictures = [] if is_file else [options.out / PLOT]
+    make_folder(table.parent, [path.name for path in (table, *pictures)])
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
                  silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
         scope = sampler.arm(session, options.signals, options.trigger, before=options.before, divider=options.divider)
         recording = scope.read(options.timeout)
-    table = {"time_s": recording.time_s, **recording.values}
-    _write_columns(table, options.out / TABLE)
-    plot_recording(recording, options.out / PLOT, options.trigger or "at once")
-    print(f"{options.trigger or 'at once'}: {len(recording.time_s)} records from {1e3 * recording.time_s[0]:.3f} to "
-          f"{1e3 * recording.time_s[-1]:.3f} ms: {options.out / TABLE}, {options.out / PLOT}")
+    recording.write(table)
+    for path in pictures:
+        recording.plot(path, scope.title)
+    print(f"{scope.title}: {len(recording.time_s)} records from {1e3 * recording.time_s[0]:.3f} to "
+          f"{1e3 * recording.time_s[-1]:.3f} ms: {', '.join(map(str, (table, *pictures)))}")
     return 0
-
-
-def plot_recording(recording: sampler.Recording, path: Path, title: str) -> None:
-    """Each signal over the time from the trigger on."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 1.5 + 1.6 * len(recording.values)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = np.atleast_1d(figure.subplots(len(recording.values), 1, sharex=True))
-    time_ms = recording.time_s * _MS_PER_S
-    for axis, (name, values), colour in zip(axes, recording.values.items(), COLOURS * 2, strict=False):
-        axis.step(time_ms, values, where="post", color=colour, linewidth=1)
-        axis.axvline(0.0, color="grey", linewidth=0.8)
-        _label(axis, name if name in SHORT_NAMES else f"{name}, {recording.units[name]}".rstrip(", "))
-        if name in recording.names:
-            labels = short_names(recording.names[name])
-            axis.set_yticks(list(labels), list(labels.values()))
-    axes[-1].set_xlabel("time from the trigger, ms")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
 def _listen(session: Session, others: Sequence[Database]) -> None:
@@ -140,14 +123,7 @@ def columns(trace: FaultTrace) -> dict[str, np.ndarray]:
 
 def write_table(trace: FaultTrace, path: Path) -> None:
     """Comma-separated values, the last row at the fault."""
-    _write_columns(columns(trace), path)
-
-
-def _write_columns(of: Mapping[str, np.ndarray], path: Path) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(of)
-        writer.writerows([f"{value:.9g}" for value in row] for row in zip(*of.values(), strict=True))
+    write_columns(columns(trace), path)
 
 
 def plot(trace: FaultTrace, path: Path, title: str) -> None:
@@ -166,22 +142,16 @@ def plot(trace: FaultTrace, path: Path, title: str) -> None:
         duties.step(time_ms, _PERCENT * trace.upper_duty[:, phase], where="post", color=COLOURS[phase], label="upper")
         duties.step(time_ms, _PERCENT * trace.lower_duty[:, phase], where="post", color=COLOURS[phase],
                     linestyle="dotted", label="lower")
-        _label(duties, f"duty {PHASES[phase]}, %")
+        label_axes(duties, f"duty {PHASES[phase]}, %")
         duties.set_ylim(-5, 105)
         duties.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
-    _label(currents, "current, A")
+    label_axes(currents, "current, A")
     currents.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
     for axes, name, values in ((torque, "torque\nreference, N m", trace.torque_reference_Nm),
                                (speed, "speed, r/min", trace.speed_rpm), (voltage, "DC link, V", trace.bus_voltage_V)):
         axes.plot(time_ms, values, color=COLOURS[2])
-        _label(axes, name)
+        label_axes(axes, name)
     of_phases[-1].set_xlim(time_ms[0], time_ms[-1] - time_ms[0] * 0.02)
     of_phases[-1].set_xlabel("time before the control interrupt that latched the fault, ms")
     figure.suptitle(title)
     figure.savefig(path, dpi=90, metadata={"Software": None})
-
-
-def _label(axes: Any, name: str) -> None:
-    axes.set_ylabel(name, fontsize="small")
-    axes.ticklabel_format(useOffset=False)
-    axes.grid(alpha=0.3)

@@ -93,8 +93,9 @@ class Session(KnownAttributes):
     telemetry and truth are the first drive's; drives[1] and rigs[1] have their own telemetry and truth.
 
     time_ns: virtual time. log: every (time_ns, message) since the session began, in bus order. sent: likewise what the
-    session has sent, but for RIG_RUN_UNTIL. telemetry, truth: signals of the drive and of the test bench by name, all
-    frames or, with signals=LatestSignals, the latest: for a session of any length, whose owner clears log and sent.
+    session has sent, but for RIG_RUN_UNTIL. scopes: what scope() has returned. telemetry, truth: signals of the drive
+    and of the test bench by name, all frames or, with signals=LatestSignals, the latest: for a session of any length,
+    whose owner clears log and sent.
     """
 
     address: str
@@ -103,6 +104,7 @@ class Session(KnownAttributes):
     time_ns: int
     log: list[tuple[int, can.Message]]
     sent: list[tuple[int, can.Message]]
+    scopes: list[Scope]
     telemetry: SignalTable
     truth: SignalTable
     drive_database: Database
@@ -122,6 +124,7 @@ class Session(KnownAttributes):
         self.time_ns = 0
         self.log = []
         self.sent = []
+        self.scopes = []
         self._carrier = Carrier(address, machine, node, option=machine_option)
         self._tables: list[SignalTable] = []
         self.drives = []
@@ -225,7 +228,8 @@ class Session(KnownAttributes):
         "state"], trigger="state == fault"); its read() gives the arrays. See salient.bench.sampler.arm."""
         from salient.bench import sampler  # needs it in turn
 
-        return sampler.arm(self, signals, trigger, before=before, divider=divider)
+        self.scopes.append(sampler.arm(self, signals, trigger, before=before, divider=divider))
+        return self.scopes[-1]
 
     def run_for(self, duration_s: float) -> None:
         """Lets virtual time pass; commands go out as they fall due.

@@ -6,7 +6,7 @@ has only the frames that carry it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
@@ -76,12 +76,18 @@ class Mf4Log(DecodedLog):
         conversion: dict[str, object] | None = None
         samples = signal.value
         if signal.choices and is_enumeration(definition):
-            conversion = {"default": b""}
-            for index, (number, text) in enumerate(signal.choices.items()):
-                conversion |= {f"val_{index}": int(number), f"text_{index}": text.encode()}
+            conversion = names_conversion(signal.choices)
             samples = samples.astype(np.int64)
         return self._signal(samples, signal.time_s, unit=signal.unit, name=signal.name, conversion=conversion,
                             comment=definition.comment or "")
+
+
+def names_conversion(names: Mapping[int, str] | Mapping[float, str]) -> dict[str, object]:
+    """asammdf's conversion of numbers to names."""
+    conversion: dict[str, object] = {"default": b""}
+    for index, (number, text) in enumerate(names.items()):
+        conversion |= {f"val_{index}": int(number), f"text_{index}": text.encode()}
+    return conversion
 
 
 def _selection(signal: Signal) -> tuple[str, list[int]]:

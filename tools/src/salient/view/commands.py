@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -11,8 +11,13 @@ import numpy as np
 
 from salient.bench.drive import DriveError
 from salient.bench.faults import FaultError, fault_kind
+from salient.bench.recording import Recording
 from salient.bench.rig import Fault, RigError
+from salient.bench.sampler import Scope, ScopeError, arm
+from salient.bench.variables import SIGNALS, short_names
+from salient.bench.xcp import XcpError
 from salient.bus.identity import OtherDatabase
+from salient.errors import UsageError
 from salient.machine.parameter_table import CHOICES, value_number
 from salient.view.link import Link
 
@@ -32,12 +37,19 @@ COMMANDS: dict[str, dict[str, type]] = {
     "save_parameters": {},
     "fault_trace": {},
     "fault_log": {},
+    "scope_names": {},
+    "scope_arm": {"signals": list},
+    "scope_trigger": {},
+    "scope_read": {},
 }
 """Commands of page/source.js that a drive on a bus carries out, with the arguments that each must have."""
 _OPTIONAL: dict[str, dict[str, type]] = {
     "fault": {"phase": str, "leg": str, "value": object, "duration_s": float},
     "end_fault": {"phase": str, "leg": str},
+    "scope_arm": {"trigger": str, "before": float, "divider": float},
 }
+_PART_WORDS = 256
+"""A part of the buffer takes 30 ms of a bus: so long a command to stop waits at most."""
 
 
 class Malformed(Exception):
@@ -54,6 +66,8 @@ def check_command(name: Any, arguments: Any) -> None:
     for key, value in arguments.items():
         if not _is(value, {**optional, **required}[key]):
             raise Malformed
+    if name == "scope_arm" and not all(isinstance(signal, str) for signal in arguments["signals"]):
+        raise Malformed
     if name == "set_parameters" and not all(_is(value, float) or value in CHOICES.get(parameter, ())
                                             for parameter, value in arguments["values"].items()):
         raise Malformed
@@ -71,13 +85,15 @@ class Commander:
     def __init__(self, link: Link) -> None:
         self._link = link
         self._faults: list[Fault] = []
+        self._scope: Scope | None = None
+        self._parts: Iterator[Recording | None] | None = None
 
     def execute(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """The answer to a checked command: ok, message, and the value where there is one."""
         action: Callable[..., Any] = getattr(self, f"_{name}")
         try:
             value = action(**arguments)
-        except (DriveError, OtherDatabase, RigError, FaultError) as error:
+        except (DriveError, OtherDatabase, RigError, FaultError, XcpError, ScopeError, UsageError) as error:
             return {"ok": False, "message": str(error)}
         except KeyError as error:
             return {"ok": False, "message": str(error.args[0])}
@@ -136,3 +152,39 @@ class Commander:
 
     def _fault_log(self) -> list[dict[str, Any]]:
         return [asdict(fault) for fault in self._link.drive.fault_log.read()]
+
+    def _scope_names(self) -> list[str]:
+        """Short names of variables; any path in the drive's memory is one, too."""
+        return list(SIGNALS)
+
+    def _scope_arm(self, signals: list[str], trigger: str = "", before: float = 0.25, divider: float = 1) -> None:
+        with self._link.kept_log():
+            self._scope = arm(self._link, signals, trigger or None, before=before, divider=int(divider))
+        self._parts = None
+
+    def _scope_trigger(self) -> None:
+        with self._link.kept_log():
+            self._armed.trigger()
+
+    def _scope_read(self) -> dict[str, Any]:
+        """state: "waits", "reads", of which each call does a part, or "complete", with the recording."""
+        with self._link.kept_log():
+            if self._parts is None:
+                if not self._armed.is_complete():
+                    return {"state": "waits"}
+                self._parts = self._armed.parts(_PART_WORDS)
+            recording = next(self._parts)
+        if recording is None:
+            return {"state": "reads"}
+        self._parts = None
+        return {"state": "complete", "title": self._armed.title, "time_s": recording.time_s.tolist(),
+                "signals": [{"name": name, "unit": recording.units[name], "values": values.tolist(),
+                             "choices": {str(number): text for number, text in
+                                         short_names(recording.names[name]).items()} if name in recording.names else None}
+                            for name, values in recording.values.items()]}
+
+    @property
+    def _armed(self) -> Scope:
+        if self._scope is None:
+            raise ScopeError("the buffer is not armed")
+        return self._scope

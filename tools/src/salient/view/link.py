@@ -5,8 +5,9 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from typing import Any
 
 import can
@@ -64,6 +65,9 @@ class Link:
         self.shown_ns: int | None = None
         """State shown by the commanding page; None without one."""
         self.drive_database, self.rig_database = drive_database(machine, node), rig_database(node)
+        self.machine: str | None = machine
+        self.log: list[tuple[int, can.Message]] = []
+        self._keeps_log = False
         self.telemetry: SignalTable = LatestSignals(self.drive_database, "DRIVE")
         self.truth: SignalTable = LatestSignals(self.rig_database, "RIG")
         self._machine = machine
@@ -122,6 +126,20 @@ class Link:
             if message is not None and matches(message):
                 return message
         raise RigError("no test bench answers on this bus")
+
+    def run_for(self, duration_s: float) -> None:
+        """Receives for a time."""
+        self.advance_to(self.time_ns + round(1e9 * duration_s))
+
+    @contextmanager
+    def kept_log(self) -> Iterator[None]:
+        """What is received meanwhile is in the log, which is empty otherwise."""
+        self._keeps_log = True
+        try:
+            yield
+        finally:
+            self._keeps_log = False
+            self.log.clear()
 
     def advance_to(self, time_ns: int) -> None:
         """Receives until that time; DriveError when the drive restarts before."""
@@ -202,6 +220,8 @@ class Link:
         self.time_ns = max(self.time_ns, time_ns)
         self.telemetry.add(time_ns, message)
         self._chunk.add(time_ns, message)
+        if self._keeps_log:
+            self.log.append((time_ns, message))
         self._traffic.add(time_ns, message)
         if (due_ns := self.drive.due_ns) is not None and due_ns <= self.time_ns:
             self._send_due()

@@ -52,6 +52,7 @@ NAMING = {"false_alarm", "wrong_cause", "not_first"}
 """Rules about the name of a fault: the fault of a flip has none among the bench's."""
 REACTION_US = 10_000
 """Time for a fault after a change of memory, as fault_effects.c has it."""
+RING = "sampler.ring"
 DECIDING = ("command", "control.state_machine", "control.duty_q15", "comms.commands", "comms.command", "ramping")
 """Members that decide whether the drive runs, whatever its controller: every bit of them flips with one of them."""
 PARTS = ("sample", "deciding")
@@ -116,6 +117,14 @@ def serve(task: tuple[str, int, int, int, int, int, str]) -> Result:
             "causes": causes, "found": found}
 
 
+def sampled(layout: Layout, first: int, stride: int) -> tuple[range, range]:
+    """Every stride-th bit from the first on, but for the ring of the recorder: half of the memory, which decides
+    nothing."""
+    ring = layout.bits(RING)
+    return (range(first, ring.start, stride),
+            range(ring.stop + (first - ring.stop) % stride, 8 * layout.size, stride))
+
+
 def tasks(stride: int, seed: int, layout: Layout, controllers: Iterable[int] = range(len(CONTROLLERS))) -> list[Task]:
     """Chunks of the bits for each controller and state. UsageError: an even stride."""
     if stride % 2 == 0:
@@ -123,9 +132,10 @@ def tasks(stride: int, seed: int, layout: Layout, controllers: Iterable[int] = r
     made = []
     for controller in controllers:
         for state in range(len(STATES)):
-            sampled = range(random.Random(f"{seed} {controller} {state}").randrange(stride), 8 * layout.size, stride)
+            first = random.Random(f"{seed} {controller} {state}").randrange(stride)
             deciding = DECIDING if controller == _SALIENT else ()
-            places = [("sample", sampled), *(("deciding", layout.bits(member)) for member in deciding)]
+            places = [*(("sample", bits) for bits in sampled(layout, first, stride)),
+                      *(("deciding", layout.bits(member)) for member in deciding)]
             for part, bits in places:
                 for begin in range(0, len(bits), CHUNK):
                     chunk = bits[begin: begin + CHUNK]
@@ -147,7 +157,7 @@ def summary(results: Iterable[Result], layout: Layout, stride: int, seed: int) -
             member = re.sub(r"\[\d+\]", "[]", layout.member(flip["bit"]))
             members[flip["class"]][f"{member}: {', '.join(flip['rules']) or combination}"] += 1
     every = [counts for found in classes.values() for counts in found.values()]
-    return {"commit": commit(), "stride": stride, "seed": seed, "bits": 8 * layout.size,
+    return {"commit": commit(), "stride": stride, "seed": seed, "bits": 8 * layout.size - len(layout.bits(RING)),
             "flips": sum(counts.total() for counts in every), "unsafe": sum(counts["unsafe"] for counts in every),
             "classes": {part: {name: {of: counts[of] for of in CLASSES} for name, counts in sorted(found.items())}
                         for part, found in classes.items()},
@@ -168,7 +178,7 @@ _HEAD = """# Flipped bits
 
 Written by `python -m salient.experiments.campaign.flips DIR --page FILE`; do not edit.
 
-- A bit of the drive's memory (`drive_t`, {bits:,} bits on the host) flips between two control periods; of all members
+- A bit of the drive's memory (`drive_t`, {bits:,} bits on the host without the ring of the recorder) flips between two control periods; of all members
   one in {stride}, seed {seed}, and with `salient` every bit of those that decide whether it runs. Commit {commit}.
 - Machine `saturating`, 40 kHz. To the [checkers](checkers.md) nothing is disturbed, so that every rule holds.
 - `ready`: not armed. A set of parameters, arming, a run under load and `off` follow.

@@ -8,6 +8,7 @@ import { textOf } from "./decoder.js";
 import { FirstRun } from "./first_run.js";
 import { drawLoops, drawMachine, MachineState } from "./machine.js";
 import { PHASE_COLOURS, PHASE_NAMES } from "./palette.js";
+import { makeScope } from "./scope.js";
 import { Store } from "./store.js";
 import { RotorTime, Timeline, Trigger } from "./timeline.js";
 
@@ -70,6 +71,7 @@ class Page {
         this.activeFaults = new ActiveFaults(act, this.store, info.faults);
         makeParameters(act, info.parameter_choices);
         makeRecord(act);
+        makeScope(act);
         makeSignals(info.databases, SIGNALS_AT_START, (names) => this.choose(names));
         this.choose(SIGNALS_AT_START);
         this.makeToolbar();
@@ -120,7 +122,7 @@ class Page {
         element("take").setAttribute("aria-pressed", yours);
         element("take").title = this.lease === "other" ? "Another page commands" : "Only one page commands a drive";
         element("stop").disabled = !yours;
-        for (const id of ["run-panel", "fault-panel", "parameter-panel", "record-panel"]) {
+        for (const id of ["run-panel", "fault-panel", "parameter-panel", "record-panel", "scope-panel"]) {
             element(id).inert = !yours && this.info.commands.includes("take");
             element(id).style.opacity = element(id).inert ? 0.55 : 1;
         }

@@ -124,6 +124,11 @@ export const COMMANDS = {
     //                       torque_reference_Nm[], upper_duty[][phase], lower_duty[][phase] }
     fault_log: {}, // -> [{ number, start, time_s, fault, checks[], state, speed_rpm, bus_voltage_V, current_max_A,
     //                      torque_reference_Nm }]
+    scope_names: {}, // -> [short name of a variable of the drive]
+    scope_arm: { signals: "string[]", trigger: "string?", before: "number?", divider: "number?" },
+    scope_trigger: {}, // now
+    scope_read: {}, // -> { state: "waits" | "reads" | "complete", and of a complete buffer title, time_s[],
+    //                     signals: [{ name, unit, values[], choices }] }; "reads" is to be asked on
     pause: {}, // a source that moves time: time stands still, goes on, takes one step, goes back
     resume: {},
     step: { s: "number" },
