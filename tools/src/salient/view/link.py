@@ -133,7 +133,7 @@ class Link:
 
     @contextmanager
     def kept_log(self) -> Iterator[None]:
-        """What is received meanwhile is in the log, which is empty otherwise."""
+        """The frames received meanwhile are in the log, which is empty otherwise."""
         self._keeps_log = True
         try:
             yield
