@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -177,14 +177,17 @@ class Commander:
         if recording is None:
             return {"state": "reads"}
         self._parts = None
+        signals = [{"name": name, "unit": recording.units[name], "values": values.tolist(),
+                    "choices": _choices(recording.names.get(name))} for name, values in recording.values.items()]
         return {"state": "complete", "title": self._armed.title, "time_s": recording.time_s.tolist(),
-                "signals": [{"name": name, "unit": recording.units[name], "values": values.tolist(),
-                             "choices": {str(number): text for number, text in
-                                         short_names(recording.names[name]).items()} if name in recording.names else None}
-                            for name, values in recording.values.items()]}
+                "signals": signals}
 
     @property
     def _armed(self) -> Scope:
         if self._scope is None:
             raise ScopeError("the buffer is not armed")
         return self._scope
+
+
+def _choices(names: Mapping[int, str] | None) -> dict[str, str] | None:
+    return None if names is None else {str(number): text for number, text in short_names(names).items()}
