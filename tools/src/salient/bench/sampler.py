@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -126,8 +126,8 @@ class Scope:
                 if self._session.time_ns >= deadline_ns:
                     raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
                 self._session.run_for(_POLL_S)
-        *_, self.recording = self.parts()
-        return self.recording
+        *_, recording = self.parts()
+        return cast(Recording, recording)
 
     def is_complete(self) -> bool:
         """The buffer is to be read."""

@@ -179,7 +179,8 @@ _HEAD = """# Flipped bits
 Written by `python -m salient.experiments.campaign.flips DIR --page FILE`; do not edit.
 
 - A bit of the drive's memory (`drive_t`, {bits:,} bits on the host without the ring of the recorder) flips between two
-  control periods; of all members one in {stride}, seed {seed}, and with `salient` every bit of those that decide whether it runs. Commit {commit}.
+  control periods; of all members one in {stride}, seed {seed}, and with `salient` every bit of those that decide
+  whether it runs. Commit {commit}.
 - Machine `saturating`, 40 kHz. To the [checkers](checkers.md) nothing is disturbed, so that every rule holds.
 - `ready`: not armed. A set of parameters, arming, a run under load and `off` follow.
 - `armed`: for a run, at standstill. Likewise.
