@@ -51,7 +51,12 @@ static void stop(canopen_t *canopen, canopen_state_t state, canopen_state_t afte
 
 static void enable(canopen_t *canopen, const canopen_context_t *context) {
     commands_t *commands = context->commands;
-    if (canopen->nmt != CANOPEN_NMT_OPERATIONAL || canopen->measured.state != DRIVE_STATE_READY || canopen->bus_off) {
+    if (canopen->nmt != CANOPEN_NMT_OPERATIONAL || canopen->bus_off) {
+        return;
+    }
+    if (canopen->measured.state != DRIVE_STATE_READY) {
+        canopen->drive.enabling = true;
+        canopen->drive.enabling_us = context->time_us;
         return;
     }
     commands_disarm(commands);
@@ -128,6 +133,7 @@ COLD void canopen_drive_control(canopen_t *canopen, const canopen_context_t *con
     const bool resets = (word & FAULT_RESET) != 0 && !drive->reset_bit;
     drive->reset_bit = (word & FAULT_RESET) != 0;
     const command_code_t code = decode(word);
+    drive->enabling = false;
     switch (drive->state) {
     case CANOPEN_SWITCH_ON_DISABLED:
         if (code == SHUTDOWN) {
@@ -220,6 +226,8 @@ static void follow_drive(canopen_t *canopen, const canopen_context_t *context) {
         return;
     }
     drive->clearing = false;
+    drive->enabling = drive->enabling && drive->state == CANOPEN_SWITCHED_ON &&
+                      context->time_us - drive->enabling_us < CANOPEN_ENABLING_US;
     if (measured->state == DRIVE_STATE_INITIALISE) {
         rest(canopen, context, CANOPEN_NOT_READY);
     } else if (drive->state == CANOPEN_NOT_READY || (drive->state == CANOPEN_FAULT && !drive->lost)) {
@@ -227,6 +235,9 @@ static void follow_drive(canopen_t *canopen, const canopen_context_t *context) {
         canopen->reported_fault = FAULT_NONE;
     } else if (canopen_enabled(canopen) && !context->commands->arming.armed) {
         rest(canopen, context, CANOPEN_SWITCH_ON_DISABLED);
+    } else if (drive->enabling && measured->state == DRIVE_STATE_READY) {
+        drive->enabling = false;
+        enable(canopen, context);
     } else if (drive->stopping && drive->state != drive->after && canopen_demand_rests(canopen, context->time_us)) {
         rest(canopen, context, drive->after);
     }

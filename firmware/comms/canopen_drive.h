@@ -21,6 +21,9 @@
 
 #include "comms/canopen_types.h"
 
+/* Enable operation waits so long for a drive that has just been disabled. */
+#define CANOPEN_ENABLING_US 20000u
+
 /* The drive is asked to clear its fault for so long. */
 #define CANOPEN_CLEARING_US 100000u
 

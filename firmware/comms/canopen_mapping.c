@@ -60,9 +60,10 @@ COLD uint32_t canopen_mapping_find(int32_t mapped, unsigned access, canopen_obje
     return bits == 8u * canopen_bytes(object) ? CANOPEN_DONE : CANOPEN_MAPPING_LENGTH;
 }
 
-/* All objects of a mapping are good, and not longer than a frame. */
+/* All objects of a mapping are good, and not longer than a frame; the controlword is among them once, so that no single
+ * frame enables the drive. */
 static uint32_t check_count(const canopen_t *canopen, unsigned map, int32_t count, unsigned access) {
-    unsigned bytes = 0;
+    unsigned bytes = 0, controls = 0;
     for (unsigned i = 0; i < (unsigned)count; i++) {
         canopen_object_t object;
         const uint32_t found = canopen_mapping_find(canopen->values[map + i], access, &object);
@@ -70,8 +71,11 @@ static uint32_t check_count(const canopen_t *canopen, unsigned map, int32_t coun
             return found;
         }
         bytes += canopen_bytes(&object);
+        controls += canopen_slot(&object) == CANOPEN_VALUE_CONTROLWORD ? 1u : 0u;
     }
-    return bytes <= 8u ? CANOPEN_DONE : CANOPEN_MAPPING_LENGTH;
+    return bytes > 8u                                ? CANOPEN_MAPPING_LENGTH
+           : controls > 1u && access == CANOPEN_RPDO ? CANOPEN_INCOMPATIBLE
+                                                     : CANOPEN_DONE;
 }
 
 static uint32_t check_id(const canopen_t *canopen, unsigned value, unsigned pdo, uint32_t wanted) {

@@ -65,34 +65,34 @@ static unsigned mapped_bytes(const canopen_t *canopen, unsigned pdo) {
     return bytes;
 }
 
+static void receive(canopen_t *canopen, const canopen_context_t *context, unsigned pdo, const hal_can_frame_t *frame) {
+    canopen_rpdo_t *rpdo = &canopen->rpdo[pdo];
+    const unsigned bytes = mapped_bytes(canopen, pdo), length = fixed_min_u32(frame->length, sizeof rpdo->data);
+    if (length != bytes) {
+        canopen_emergency(canopen, length < bytes ? LENGTH_SHORT : LENGTH_LONG, FAULT_NONE);
+    }
+    if (length < bytes) {
+        return;
+    }
+    rpdo->seen = true;
+    rpdo->time_us = context->time_us;
+    rpdo->length = (uint8_t)length;
+    memcpy(rpdo->data, frame->data, length);
+    rpdo->waiting = canopen->values[CANOPEN_VALUE_RPDO_TYPE + pdo] <= CANOPEN_PDO_SYNC_MAX;
+    if (!rpdo->waiting) {
+        take(canopen, context, pdo);
+    }
+}
+
 COLD bool canopen_pdo_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
-    bool found = false;
-    for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
+    for (unsigned pdo = 0; pdo < CANOPEN_PDOS && canopen->nmt == CANOPEN_NMT_OPERATIONAL; pdo++) {
         const uint32_t id = canopen_mapping_id(canopen, CANOPEN_VALUE_RPDO_ID, pdo);
-        if ((id & CANOPEN_PDO_NOT_VALID) != 0 || (id & CANOPEN_PDO_ID) != frame->identifier ||
-            canopen->nmt != CANOPEN_NMT_OPERATIONAL) {
-            continue;
-        }
-        found = true;
-        const unsigned bytes = mapped_bytes(canopen, pdo), length = fixed_min_u32(frame->length, 8u);
-        if (length < bytes) {
-            canopen_emergency(canopen, LENGTH_SHORT, FAULT_NONE);
-            continue;
-        }
-        if (length > bytes) {
-            canopen_emergency(canopen, LENGTH_LONG, FAULT_NONE);
-        }
-        canopen_rpdo_t *rpdo = &canopen->rpdo[pdo];
-        rpdo->seen = true;
-        rpdo->time_us = context->time_us;
-        rpdo->length = (uint8_t)length;
-        memcpy(rpdo->data, frame->data, length);
-        rpdo->waiting = canopen->values[CANOPEN_VALUE_RPDO_TYPE + pdo] <= CANOPEN_PDO_SYNC_MAX;
-        if (!rpdo->waiting) {
-            take(canopen, context, pdo);
+        if ((id & CANOPEN_PDO_NOT_VALID) == 0 && (id & CANOPEN_PDO_ID) == frame->identifier) {
+            receive(canopen, context, pdo, frame);
+            return true;
         }
     }
-    return found;
+    return false;
 }
 
 /* Bytes of the present values of what is mapped. */

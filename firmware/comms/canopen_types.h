@@ -118,6 +118,8 @@ typedef struct {
     bool at_rest;        /* it is */
     uint32_t step_us;    /* time of the last step */
     uint32_t clearing_us;
+    bool enabling; /* enable operation has come before the drive was ready */
+    uint32_t enabling_us;
     uint32_t within_us; /* for which the velocity is within its window */
     uint32_t slow_us;   /* for which it is below its threshold */
     bool reset_bit;     /* bit 7 of the last controlword */
