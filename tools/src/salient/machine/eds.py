@@ -8,7 +8,15 @@ from pathlib import Path
 from salient.errors import UsageError
 from salient.machine.content import machine_hash
 from salient.machine.file import load_machine
-from salient.machine.object_dictionary import BITS, PARAMETER_BASE, TYPES, Entry, Object, parameter_entries, read_dictionary
+from salient.machine.object_dictionary import (
+    BITS,
+    PARAMETER_BASE,
+    TYPES,
+    Entry,
+    Object,
+    parameter_entries,
+    read_dictionary,
+)
 from salient.machine.parameter_table import read_table
 from salient.machine.path import machine_path
 from salient.machine.scaling import scaling_of
@@ -106,8 +114,9 @@ def _object(of: Object, node_id: int, known: dict[tuple[int, int], int]) -> str:
     return "\n\n".join([head, *parts])
 
 
-def _initial(entry: Entry, index: int, node_id: int, element: int, known: dict[tuple[int, int], int]) -> int:
-    """The value after a reset, of those that differ from the table's."""
+def _initial(entry: Entry, index: int, node_id: int, element: int, known: dict[tuple[int, int], int]
+             ) -> int | None:
+    """The value after a reset; None for one that the drive computes."""
     pdo = index % _PDOS
     receives = {"RPDO_ID": 0x200, "TPDO_ID": 0x180 | 0x40000000}
     if entry.value in receives:
@@ -125,17 +134,17 @@ def _initial(entry: Entry, index: int, node_id: int, element: int, known: dict[t
         return sources[entry.source] + node_id
     if entry.source in ("STORE", "RESTORE"):
         return 1
-    return known.get((index, entry.sub + element), entry.initial)
+    return known.get((index, entry.sub + element), None if entry.source else entry.initial)
 
 
-def _entry(entry: Entry, key: str, initial: int, number: int | None = None) -> str:
+def _entry(entry: Entry, key: str, initial: int | None, number: int | None = None) -> str:
     name = f"{entry.name} {number + 1}" if number is not None and entry.count > 1 else entry.name
     is_domain = entry.type == "domain"
     lines = [f"[{key}]", f"ParameterName={name}", f"ObjectType=0x{_DOMAIN if is_domain else 7:X}",
              f"DataType=0x{TYPES[entry.type]:04X}", f"AccessType={entry.access}",
              f"PDOMapping={1 if entry.pdo else 0}"]
     if entry.type in BITS:
-        lines.append(f"DefaultValue={initial}")
+        lines += [f"DefaultValue={initial}"] if initial is not None else []
         if entry.access == "rw":
             lines += [f"LowLimit={entry.minimum}", f"HighLimit={entry.maximum}"]
     elif entry.string:
