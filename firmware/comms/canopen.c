@@ -117,31 +117,44 @@ static void receive_heartbeat(canopen_t *canopen, const canopen_context_t *conte
     }
 }
 
+/* Requests of SDO count as a sign of the master, refused ones too. */
+static void receive_sdo(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
+    if (canopen->nmt != CANOPEN_NMT_STOPPED) {
+        canopen->heard_us = context->time_us;
+        canopen_sdo_receive(canopen, context, frame);
+    }
+}
+
+static void receive_data(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
+    const bool synchronises = frame->identifier == (uint32_t)canopen->values[CANOPEN_VALUE_SYNC_ID] &&
+                              canopen->nmt == CANOPEN_NMT_OPERATIONAL;
+    if (canopen_pdo_receive(canopen, context, frame)) {
+        canopen->heard_us = context->time_us;
+    } else if (synchronises) {
+        canopen->heard_us = context->time_us;
+        canopen_pdo_sync(canopen, context);
+    }
+}
+
 COLD void canopen_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
     const uint32_t id = frame->identifier;
-    const bool guarded = frame->remote && id == HEARTBEAT_ID + canopen->node;
-    if (frame->extended || canopen->restart || canopen->nmt == CANOPEN_NMT_INITIALISING ||
-        (frame->remote && !guarded)) {
+    if (frame->extended || canopen->restart || canopen->nmt == CANOPEN_NMT_INITIALISING) {
         return;
     }
-    if (guarded) {
-        respond_guard(canopen, context);
+    if (frame->remote) {
+        if (id == HEARTBEAT_ID + canopen->node) {
+            respond_guard(canopen, context);
+        }
     } else if (id == NMT_ID) {
         receive_nmt(canopen, context, frame);
     } else if (id == CANOPEN_SDO_REQUEST + canopen->node) {
-        if (canopen->nmt != CANOPEN_NMT_STOPPED) {
-            canopen->heard_us = context->time_us;
-            canopen_sdo_receive(canopen, context, frame);
-        }
+        receive_sdo(canopen, context, frame);
     } else if (id == CANOPEN_LSS_REQUEST) {
         canopen_lss_receive(canopen, context, frame);
     } else if (id > HEARTBEAT_ID && id <= HEARTBEAT_ID + CANOPEN_NODE_MAX) {
         receive_heartbeat(canopen, context, frame);
-    } else if (canopen_pdo_receive(canopen, context, frame)) {
-        canopen->heard_us = context->time_us;
-    } else if (id == (uint32_t)canopen->values[CANOPEN_VALUE_SYNC_ID] && canopen->nmt == CANOPEN_NMT_OPERATIONAL) {
-        canopen->heard_us = context->time_us;
-        canopen_pdo_sync(canopen, context);
+    } else {
+        receive_data(canopen, context, frame);
     }
 }
 

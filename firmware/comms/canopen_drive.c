@@ -127,6 +127,21 @@ static void control_enabled(canopen_t *canopen, const canopen_context_t *context
     }
 }
 
+/* Transitions of a drive that is ready to switch on, or switched on. */
+static void control_ready(canopen_t *canopen, const canopen_context_t *context, command_code_t code) {
+    canopen_drive_t *drive = &canopen->drive;
+    if (code == DISABLE_VOLTAGE || code == QUICK_STOP) {
+        drive->state = CANOPEN_SWITCH_ON_DISABLED;
+    } else if (code == SHUTDOWN) {
+        drive->state = CANOPEN_READY_TO_SWITCH_ON;
+    } else {
+        drive->state = CANOPEN_SWITCHED_ON;
+        if (code == ENABLE) {
+            enable(canopen, context);
+        }
+    }
+}
+
 COLD void canopen_drive_control(canopen_t *canopen, const canopen_context_t *context) {
     canopen_drive_t *drive = &canopen->drive;
     const uint32_t word = (uint32_t)canopen->values[CANOPEN_VALUE_CONTROLWORD];
@@ -142,16 +157,7 @@ COLD void canopen_drive_control(canopen_t *canopen, const canopen_context_t *con
         break;
     case CANOPEN_READY_TO_SWITCH_ON:
     case CANOPEN_SWITCHED_ON:
-        if (code == DISABLE_VOLTAGE || code == QUICK_STOP) {
-            drive->state = CANOPEN_SWITCH_ON_DISABLED;
-        } else if (code == SHUTDOWN) {
-            drive->state = CANOPEN_READY_TO_SWITCH_ON;
-        } else {
-            drive->state = CANOPEN_SWITCHED_ON;
-            if (code == ENABLE) {
-                enable(canopen, context);
-            }
-        }
+        control_ready(canopen, context, code);
         break;
     case CANOPEN_OPERATION_ENABLED:
         control_enabled(canopen, context, code);
@@ -210,36 +216,59 @@ COLD void canopen_drive_disable(canopen_t *canopen, const canopen_context_t *con
     rest(canopen, context, state == CANOPEN_FAULT || state == CANOPEN_NOT_READY ? state : CANOPEN_SWITCH_ON_DISABLED);
 }
 
+/* The drive is in a fault. */
+static void follow_fault(canopen_t *canopen, const canopen_context_t *context) {
+    canopen_drive_t *drive = &canopen->drive;
+    const uint8_t fault = canopen->measured.fault;
+    if (fault != canopen->reported_fault && fault < FAULT_COUNT) {
+        canopen->reported_fault = fault;
+        canopen_emergency(canopen, canopen_error_codes[fault], fault);
+    }
+    if (drive->state != CANOPEN_FAULT) {
+        rest(canopen, context, CANOPEN_FAULT);
+    }
+    drive->clearing = drive->clearing && context->time_us - drive->clearing_us < CANOPEN_CLEARING_US;
+}
+
+/* Transitions of an enabled drive by itself: disarmed, or at rest after a ramp. */
+static void follow_run(canopen_t *canopen, const canopen_context_t *context) {
+    const canopen_drive_t *drive = &canopen->drive;
+    if (!context->commands->arming.armed) {
+        rest(canopen, context, CANOPEN_SWITCH_ON_DISABLED);
+    } else if (drive->stopping && drive->state != drive->after && canopen_demand_rests(canopen, context->time_us)) {
+        rest(canopen, context, drive->after);
+    }
+}
+
+/* Enable operation that has come before the drive was ready. */
+static void follow_enabling(canopen_t *canopen, const canopen_context_t *context) {
+    canopen_drive_t *drive = &canopen->drive;
+    drive->enabling = drive->enabling && drive->state == CANOPEN_SWITCHED_ON &&
+                      context->time_us - drive->enabling_us < CANOPEN_ENABLING_US;
+    if (drive->enabling && canopen->measured.state == DRIVE_STATE_READY) {
+        drive->enabling = false;
+        enable(canopen, context);
+    }
+}
+
 /* What follows by itself from the state of the drive. */
 static void follow_drive(canopen_t *canopen, const canopen_context_t *context) {
     canopen_drive_t *drive = &canopen->drive;
-    const canopen_measured_t *measured = &canopen->measured;
-    if (measured->state == DRIVE_STATE_FAULT) {
-        if (measured->fault != canopen->reported_fault && measured->fault < FAULT_COUNT) {
-            canopen->reported_fault = measured->fault;
-            canopen_emergency(canopen, canopen_error_codes[measured->fault], measured->fault);
-        }
-        if (drive->state != CANOPEN_FAULT) {
-            rest(canopen, context, CANOPEN_FAULT);
-        }
-        drive->clearing = drive->clearing && context->time_us - drive->clearing_us < CANOPEN_CLEARING_US;
+    const drive_state_t state = canopen->measured.state;
+    if (state == DRIVE_STATE_FAULT) {
+        follow_fault(canopen, context);
         return;
     }
     drive->clearing = false;
-    drive->enabling = drive->enabling && drive->state == CANOPEN_SWITCHED_ON &&
-                      context->time_us - drive->enabling_us < CANOPEN_ENABLING_US;
-    if (measured->state == DRIVE_STATE_INITIALISE) {
+    if (state == DRIVE_STATE_INITIALISE) {
         rest(canopen, context, CANOPEN_NOT_READY);
     } else if (drive->state == CANOPEN_NOT_READY || (drive->state == CANOPEN_FAULT && !drive->lost)) {
         rest(canopen, context, CANOPEN_SWITCH_ON_DISABLED);
         canopen->reported_fault = FAULT_NONE;
-    } else if (canopen_enabled(canopen) && !context->commands->arming.armed) {
-        rest(canopen, context, CANOPEN_SWITCH_ON_DISABLED);
-    } else if (drive->enabling && measured->state == DRIVE_STATE_READY) {
-        drive->enabling = false;
-        enable(canopen, context);
-    } else if (drive->stopping && drive->state != drive->after && canopen_demand_rests(canopen, context->time_us)) {
-        rest(canopen, context, drive->after);
+    } else if (canopen_enabled(canopen)) {
+        follow_run(canopen, context);
+    } else {
+        follow_enabling(canopen, context);
     }
 }
 

@@ -12,6 +12,8 @@
 #define LOAD 0x64616F6C
 #define CAN_STORE 1 /* saves on command */
 #define ERRORS_MAX 8u
+#define SYNC_ID 0x80
+#define VELOCITY_POLARITY 0x40
 
 COLD uint32_t canopen_size_of_bytes(const canopen_context_t *context, const canopen_object_t *object) {
     if (object->row.type != CANOPEN_STRING) {
@@ -129,28 +131,36 @@ static uint32_t check_limits(const canopen_object_t *object, int32_t value) {
     return below ? CANOPEN_BELOW : above ? CANOPEN_ABOVE : CANOPEN_DONE;
 }
 
-/* Values within the limits that are not allowed. */
+/* Store and restore have a signature. */
+static uint32_t check_signature(const canopen_object_t *object, int32_t value) {
+    const bool wrong = (object->row.value == CANOPEN_FROM_STORE && value != SAVE) ||
+                       (object->row.value == CANOPEN_FROM_RESTORE && value != LOAD);
+    return wrong ? CANOPEN_NOT_STORED : CANOPEN_DONE;
+}
+
+/* Values of a variable within its limits that are not allowed. */
 static uint32_t check_choice(const canopen_t *canopen, const canopen_object_t *object, int32_t value) {
-    if ((object->row.access & CANOPEN_FROM) != 0) {
-        return (object->row.value == CANOPEN_FROM_STORE && value != SAVE) ||
-                       (object->row.value == CANOPEN_FROM_RESTORE && value != LOAD)
-                   ? CANOPEN_NOT_STORED
-                   : CANOPEN_DONE;
-    }
+    bool allowed;
     switch (object->row.value) {
     case CANOPEN_VALUE_MODE:
-        return canopen_demand_has_mode(value) ? CANOPEN_DONE : CANOPEN_VALUE;
+        allowed = canopen_demand_has_mode(value);
+        break;
     case CANOPEN_VALUE_QUICK_STOP_OPTION:
-        return value == 3 || value == 4 ? CANOPEN_VALUE : CANOPEN_DONE;
+        allowed = value != 3 && value != 4;
+        break;
     case CANOPEN_VALUE_POLARITY:
-        return value != 0 && value != 0x40 ? CANOPEN_VALUE : CANOPEN_DONE;
-    case CANOPEN_VALUE_CONSUMER:
-        return (value >> 16 == 0) != ((value & UINT16_MAX) == 0) ? CANOPEN_INCOMPATIBLE : CANOPEN_DONE;
+        allowed = value == 0 || value == VELOCITY_POLARITY;
+        break;
+    case CANOPEN_VALUE_CONSUMER: /* node and time, or neither */
+        allowed = (value >> 16 == 0) == ((value & UINT16_MAX) == 0);
+        break;
     case CANOPEN_VALUE_SYNC_ID:
-        return canopen_mapping_is_free_id((uint32_t)value) || value == 0x80 ? CANOPEN_DONE : CANOPEN_VALUE;
+        allowed = canopen_mapping_is_free_id((uint32_t)value) || value == SYNC_ID;
+        break;
     default:
         return canopen_mapping_check(canopen, object, value);
     }
+    return allowed ? CANOPEN_DONE : CANOPEN_VALUE;
 }
 
 COLD uint32_t canopen_check(const canopen_t *canopen, const canopen_object_t *object, int32_t value) {
@@ -158,7 +168,11 @@ COLD uint32_t canopen_check(const canopen_t *canopen, const canopen_object_t *ob
         return CANOPEN_READ_ONLY;
     }
     const uint32_t limits = check_limits(object, value);
-    return limits != CANOPEN_DONE ? limits : check_choice(canopen, object, value);
+    if (limits != CANOPEN_DONE) {
+        return limits;
+    }
+    return (object->row.access & CANOPEN_FROM) != 0 ? check_signature(object, value)
+                                                    : check_choice(canopen, object, value);
 }
 
 COLD uint32_t canopen_verdict(const parameters_verdict_t *verdict) {

@@ -20,12 +20,26 @@ void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
     telemetry_init(&comms->telemetry, offset, time_us);
 }
 
+/* Without CANopen (option SALIENT_CANOPEN of the build) nothing refers to its functions, which the linker removes. */
+static bool is_canopen(const comms_t *comms) {
+#ifdef SALIENT_WITHOUT_CANOPEN
+    (void)comms;
+    return false;
+#else
+    return comms->canopen.node != 0;
+#endif
+}
+
 COLD void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us) {
+#ifdef SALIENT_WITHOUT_CANOPEN
+    (void)comms, (void)protocol, (void)time_us;
+#else
     canopen_init(&comms->canopen, (unsigned)protocol, comms->node_offset / NODE_STEP + 1u, time_us);
+#endif
 }
 
 COLD void comms_bus_off(comms_t *comms) {
-    if (comms->canopen.node == 0) {
+    if (!is_canopen(comms)) {
         commands_disarm(&comms->commands);
         return;
     }
@@ -206,7 +220,7 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
     restore_node(comms);
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
-    if (comms->canopen.node != 0) {
+    if (is_canopen(comms)) {
         return background_canopen(comms, hal, objects, time_us);
     }
     xcp_supervise(&comms->xcp, comms->bus.status.state == HAL_CAN_BUS_OFF, time_us);
@@ -223,7 +237,7 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
 
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     restore_node(comms);
-    if (comms->canopen.node != 0) {
+    if (is_canopen(comms)) {
         telemetry_advance(&comms->telemetry, values->status.time_us);
         canopen_telemetry(&comms->canopen, values);
         return;

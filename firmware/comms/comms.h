@@ -68,7 +68,8 @@ typedef struct {
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
 void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
 
-/* Chooses the protocol, after comms_init. protocol: the parameter, 0 that of drive.dbc, else CANopen with this node-ID. */
+/* Chooses the protocol, after comms_init. protocol: the parameter, 0 that of drive.dbc, else CANopen with this
+ * node-ID. */
 void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us);
 
 /* Bus-off: no run begins, or goes on, by itself. [background] */
@@ -96,8 +97,8 @@ static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {
     return telemetry_due(&comms->telemetry, time_us);
 }
 
-/* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped. With CANopen
- * takes the values over. [background] */
+/* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped. With
+ * CANopen takes the values over. [background] */
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values);
 
 #endif

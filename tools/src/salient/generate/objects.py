@@ -27,7 +27,13 @@ from salient.paths import REFERENCE
 PAGE = REFERENCE / "objects.md"
 NAME = "canopen_dictionary"
 _HEAD = "/* Generated from firmware/comms/objects.toml by salient.generate.objects. */\n"
-_DECLARATIONS = """
+_DECLARATIONS = """#ifndef CANOPEN_DICTIONARY_H
+#define CANOPEN_DICTIONARY_H
+
+#include <stdint.h>
+
+#include "drive_enumerations.h"
+
 typedef enum {{
 {values}
     CANOPEN_VALUE_COUNT = {value_count}
@@ -96,13 +102,12 @@ def header(dictionary: Dictionary) -> str:
     entries = dictionary.entries()
     slots = _slots(entries)
     sources = [*dict.fromkeys(entry.source for entry in entries if entry.source), PARAMETER]
-    return _HEAD + "#ifndef CANOPEN_DICTIONARY_H\n#define CANOPEN_DICTIONARY_H\n\n#include <stdint.h>\n\n" \
-        '#include "drive_enumerations.h"\n' + _DECLARATIONS.format(
-            values="\n".join(f"    CANOPEN_VALUE_{name} = {slot}," for name, slot in slots.items() if name),
-            value_count=slots[""], sources="\n".join(f"    CANOPEN_FROM_{name}," for name in sources),
-            types="\n".join(f"    CANOPEN_{name.upper()} = {number}," for name, number in TYPES.items()),
-            rows=len(entries), base=PARAMETER_BASE, vendor=dictionary.device["vendor"],
-            product=dictionary.device["product"])
+    return _HEAD + _DECLARATIONS.format(
+        values="\n".join(f"    CANOPEN_VALUE_{name} = {slot}," for name, slot in slots.items() if name),
+        value_count=slots[""], sources="\n".join(f"    CANOPEN_FROM_{name}," for name in sources),
+        types="\n".join(f"    CANOPEN_{name.upper()} = {number}," for name, number in TYPES.items()),
+        rows=len(entries), base=PARAMETER_BASE, vendor=dictionary.device["vendor"],
+        product=dictionary.device["product"])
 
 
 def _access(entry: Entry) -> str:
@@ -150,8 +155,8 @@ Object dictionary of the drive with the parameter `protocol` above 0: [CANopen](
 
 - *Access*: `const` and `ro` are read, `rw` is read and written. *PDO*: may be mapped to receive (R), transmit (T) PDOs.
 - *Range*: values beyond it are refused with 0x06090031 or 0x06090032. *Initial*: after a reset.
-- `0x{base:04X}` to `0x{end:04X}`: the {parameters} parameters, in the order of [their table](parameters.md), as INTEGER32
-  in raw values, TPDO. They are written by the checks of [a set](../can/parameters.md#a-set-of-parameters).
+- `0x{base:04X}` to `0x{end:04X}`: the {parameters} parameters, in the order of [their table](parameters.md), as
+  INTEGER32 in raw values, TPDO. They are written by the checks of [a set](../can/parameters.md#a-set-of-parameters).
 
 | index | sub | name | type | access | PDO | range | initial | meaning |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
@@ -165,8 +170,8 @@ def _page_row(entry: Entry) -> str:
     span = f"{entry.minimum} to {entry.maximum}" if entry.access == "rw" and entry.type in BITS else ""
     initial = entry.string.replace("@VERSION", "the version") if entry.string else \
         "" if entry.source else f"0x{entry.initial:X}" if entry.initial > 100000 else f"{entry.initial}"
-    return f"| {index} | {sub} | {entry.name} | {entry.type} | {entry.access} | {pdo} | {span} | {initial} | " \
-           f"{cell(entry.text)} |"
+    cells = (index, sub, entry.name, entry.type, entry.access, pdo, span, initial, cell(entry.text))
+    return f"| {' | '.join(cells)} |"
 
 
 def page() -> str:

@@ -1,5 +1,5 @@
-"""The electronic data sheet (CiA 306) of a drive as a CANopen device: its objects with types, access, limits and initial
-values, made of firmware/comms/objects.toml, the parameters and the machine's units; never edited."""
+"""The electronic data sheet (CiA 306) of a drive as a CANopen device: its objects with types, access, limits and
+initial values, made of firmware/comms/objects.toml, the parameters and the machine's units; never edited."""
 
 from __future__ import annotations
 
