@@ -39,6 +39,7 @@ drive_config_t host_drive_config(const options_t *options, unsigned number) {
         .controller = (drive_controller_t)options->controller_index,
         .node = options->node + number,
         .telemetry_period_ms = options->telemetry_period_ms,
+        .canopen_node = options->protocol_index == OPTIONS_PROTOCOL_CANOPEN ? options->node + number + 1u : 0,
     };
 }
 

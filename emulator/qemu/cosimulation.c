@@ -200,6 +200,7 @@ bool cosimulation_open(mailbox_t *of_image, const options_t *options, bool timed
     mailbox->controller = options->controller_index;
     mailbox->node = options->node;
     mailbox->telemetry_period_ms = options->telemetry_period_ms;
+    mailbox->canopen_node = options->protocol_index == OPTIONS_PROTOCOL_CANOPEN ? options->node + 1u : 0;
     mailbox->adc_bits = hal_adc_bits(&host);
     mailbox->encoder_bits = hal_encoder_bits(&host);
     mailbox->timed = timed;

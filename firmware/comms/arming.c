@@ -77,6 +77,12 @@ static arming_result_t request(arming_t *arming, hal_t *hal, arming_attempt_t at
     return ARMING_CHALLENGED;
 }
 
+COLD void arming_arm(arming_t *arming) {
+    arming->changed = true;
+    arming->armed = 1;
+    arming->check |= CHECK_ARMED;
+}
+
 static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool permitted, const hal_can_frame_t *frame,
                                uint32_t response, uint32_t time_us) {
     const uint32_t age_us = time_us - arming->challenge_us;
@@ -90,8 +96,7 @@ static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool 
     arming->changed = true;
     arming->drawn = false;
     if (attempt == ARMING_ATTEMPT_RUN) {
-        arming->armed = 1;
-        arming->check |= CHECK_ARMED;
+        arming_arm(arming);
         return ARMING_ARMED;
     }
     arming->configuring = 1;

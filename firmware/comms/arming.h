@@ -61,6 +61,10 @@ void arming_check_timeout(arming_t *arming, uint32_t time_us);
 arming_result_t arming_receive(arming_t *arming, hal_t *hal, const hal_can_frame_t *frame, bool permitted,
                                uint32_t time_us);
 
+/* Armed for a run without a challenge: for a protocol with a procedure of its own (comms/canopen_drive.h). [background]
+ */
+void arming_arm(arming_t *arming);
+
 /* Neither armed for a run nor in an attempt to arm for one. [background] */
 void arming_disarm(arming_t *arming);
 

@@ -20,6 +20,33 @@ void comms_init(comms_t *comms, unsigned node, uint32_t time_us) {
     telemetry_init(&comms->telemetry, offset, time_us);
 }
 
+/* Without CANopen (option SALIENT_CANOPEN of the build) nothing refers to its functions, which the linker removes. */
+static bool is_canopen(const comms_t *comms) {
+#ifdef SALIENT_WITHOUT_CANOPEN
+    (void)comms;
+    return false;
+#else
+    return comms->canopen.node != 0;
+#endif
+}
+
+COLD void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us) {
+#ifdef SALIENT_WITHOUT_CANOPEN
+    (void)comms, (void)protocol, (void)time_us;
+#else
+    canopen_init(&comms->canopen, (unsigned)protocol, comms->node_offset / NODE_STEP + 1u, time_us);
+#endif
+}
+
+COLD void comms_bus_off(comms_t *comms) {
+    if (!is_canopen(comms)) {
+        commands_disarm(&comms->commands);
+        return;
+    }
+    comms->bus.run_inhibited = false; /* the reaction is that of the profile; it enables nothing by itself */
+    comms->canopen.bus_off = true;
+}
+
 /* A bit that has changed in one copy is as in both others again. */
 static void restore_node(comms_t *comms) {
     const uint32_t sends = comms->telemetry.identifier_offset, hears = comms->commands.data_id_offset;
@@ -167,12 +194,35 @@ static bool receive(comms_t *comms, hal_t *hal, const comms_objects_t *objects, 
     return false;
 }
 
+/* Receives, acts and sends as a CANopen device. */
+COLD static bool background_canopen(comms_t *comms, hal_t *hal, const comms_objects_t *objects, uint32_t time_us) {
+    const canopen_context_t context = {hal,
+                                       objects->parameters,
+                                       &objects->conditions,
+                                       &comms->set,
+                                       objects->store,
+                                       &comms->commands,
+                                       &comms->responses,
+                                       time_us};
+    hal_can_frame_t frame;
+    for (int i = 0; i < COMMS_FRAMES_PER_CALL && hal_can_receive(hal, &frame); i++) {
+        canopen_receive(&comms->canopen, &context, &frame);
+    }
+    const bool commanded = canopen_step(&comms->canopen, &context, &comms->command);
+    while (send_response(comms, hal)) {
+    }
+    return commanded;
+}
+
 bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects, drive_state_t state,
                       uint32_t time_us) {
     const parameters_t *parameters = objects->parameters;
     restore_node(comms);
     const uint32_t timeout_us = (uint32_t)parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] * US_PER_MS;
     commands_supervise(&comms->commands, state, time_us, timeout_us);
+    if (is_canopen(comms)) {
+        return background_canopen(comms, hal, objects, time_us);
+    }
     xcp_supervise(&comms->xcp, comms->bus.status.state == HAL_CAN_BUS_OFF, time_us);
     comms->set.begun = comms->set.begun && comms->commands.arming.configuring;
     telemetry_set_period(&comms->telemetry, DRIVE_TELEMETRY_RATE_FAST,
@@ -187,6 +237,11 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
 
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values) {
     restore_node(comms);
+    if (is_canopen(comms)) {
+        telemetry_advance(&comms->telemetry, values->status.time_us);
+        canopen_telemetry(&comms->canopen, values);
+        return;
+    }
     comms->telemetry.background_in_mailbox &= comms->bus.status.transmitting;
     telemetry_cycle(&comms->telemetry, values);
     comms->response_first = comms->telemetry.backlog;

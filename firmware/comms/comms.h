@@ -20,6 +20,7 @@
 #include <stdint.h>
 
 #include "comms/bus_monitor.h"
+#include "comms/canopen.h"
 #include "comms/commands.h"
 #include "comms/frame_queue.h"
 #include "comms/parameter_set.h"
@@ -51,6 +52,7 @@ typedef struct {
     command_t command;       /* last accepted command */
     uint32_t arming_sent_us; /* when DRIVE_ARMING last entered a mailbox because of a change */
     uint32_t node_offset;    /* of identifiers and data IDs; the other two copies are in telemetry and commands */
+    canopen_t canopen;       /* in place of all above but bus, responses, set and command when it has a node-ID */
 } comms_t;
 
 /* Objects that requests read or change, for one call. */
@@ -65,6 +67,13 @@ typedef struct {
 
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
 void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
+
+/* Chooses the protocol, after comms_init. protocol: the parameter, 0 that of drive.dbc, else CANopen with this
+ * node-ID. */
+void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us);
+
+/* Bus-off: no run begins, or goes on, by itself. [background] */
+void comms_bus_off(comms_t *comms);
 
 /* Sends waiting frames and processes at most COMMS_FRAMES_PER_CALL received frames. Returns true when a command was
  * accepted, in comms->command; reception stops there, so that the caller sees every command, in order. state: of the
@@ -88,8 +97,8 @@ static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {
     return telemetry_due(&comms->telemetry, time_us);
 }
 
-/* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped.
- * [background] */
+/* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped. With
+ * CANopen takes the values over. [background] */
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values);
 
 #endif

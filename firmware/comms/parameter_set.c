@@ -42,16 +42,38 @@ static parameters_verdict_t apply(const parameter_set_t *set, uint32_t crc, para
     return verdict;
 }
 
-parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *parameters,
-                                       const parameters_conditions_t *conditions, unsigned index, int32_t value) {
+bool parameter_set_begin(parameter_set_t *set, const parameters_t *parameters, bool defaults) {
     if (!parameters_intact(parameters)) {
-        return (parameters_verdict_t){PARAMETER_STATUS_MEMORY, 0, 0};
+        return false;
     }
-    begin(set, parameters, false);
+    begin(set, parameters, defaults);
+    return true;
+}
+
+void parameter_set_stage(parameter_set_t *set, unsigned index, int32_t value) {
     stage(set, index, value);
+}
+
+void parameter_set_stage_byte(parameter_set_t *set, unsigned offset, uint8_t byte) {
+    const unsigned index = offset / sizeof set->values[0], shift = 8u * (offset % sizeof set->values[0]);
+    const uint32_t kept = (uint32_t)set->values[index] & ~((uint32_t)UINT8_MAX << shift);
+    stage(set, index, (int32_t)(kept | (uint32_t)byte << shift));
+}
+
+parameters_verdict_t parameter_set_finish(parameter_set_t *set, parameters_t *parameters,
+                                          const parameters_conditions_t *conditions) {
     const parameters_verdict_t verdict = apply(set, set->crc, parameters, conditions);
     set->begun = false;
     return verdict;
+}
+
+parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *parameters,
+                                       const parameters_conditions_t *conditions, unsigned index, int32_t value) {
+    if (!parameter_set_begin(set, parameters, false)) {
+        return (parameters_verdict_t){PARAMETER_STATUS_MEMORY, 0, 0};
+    }
+    stage(set, index, value);
+    return parameter_set_finish(set, parameters, conditions);
 }
 
 static parameters_verdict_t save(nvm_store_t *store, bool running) {

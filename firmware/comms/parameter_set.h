@@ -37,6 +37,18 @@ void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame);
 parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *parameters,
                                        const parameters_conditions_t *conditions, unsigned index, int32_t value);
 
+/* Begins a set: staged are the values in effect, or with `defaults` the defaults. False, with nothing begun, when those
+ * in effect have changed in memory. [background] */
+bool parameter_set_begin(parameter_set_t *set, const parameters_t *parameters, bool defaults);
+
+/* Stages a value, or a byte of one; index 0..PARAMETER_COUNT-1, offset below 4 PARAMETER_COUNT. [background] */
+void parameter_set_stage(parameter_set_t *set, unsigned index, int32_t value);
+void parameter_set_stage_byte(parameter_set_t *set, unsigned offset, uint8_t byte);
+
+/* Checks the staged set, applies it when it passes, and ends it. [background] */
+parameters_verdict_t parameter_set_finish(parameter_set_t *set, parameters_t *parameters,
+                                          const parameters_conditions_t *conditions);
+
 /* Executes a PARAMETER_SET_CONTROL that has passed commands_receive and writes its response. armed: for configuration.
  * True when that state ends. [background] */
 bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *parameters, nvm_store_t *store,

@@ -116,6 +116,21 @@ static void follow_fault(telemetry_t *telemetry, const drive_telemetry_t *values
     telemetry->in_fault = in_fault;
 }
 
+void telemetry_advance(telemetry_t *telemetry, uint32_t time_us) {
+    uint32_t cycles = 1;
+    /* Negative when the values were collected a little before the cycle was due. */
+    int32_t late_us = (int32_t)(time_us - telemetry->next_us);
+    if (late_us < -TELEMETRY_CYCLE_US) { /* changed in memory: telemetry_due() */
+        telemetry->next_us = time_us;
+        late_us = 0;
+    }
+    if (late_us >= TELEMETRY_CYCLE_US) {
+        cycles += (uint32_t)late_us / TELEMETRY_CYCLE_US;
+    }
+    telemetry->next_us += cycles * TELEMETRY_CYCLE_US;
+    telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
+}
+
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->backlog = frame_queue_peek(&telemetry->queue) != NULL;
     follow_fault(telemetry, values);
@@ -126,18 +141,7 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_BACKGROUND, true, values);
     enqueue_background(telemetry, DRIVE_TELEMETRY_GROUP_IDLE, !telemetry->backlog, values);
 
-    uint32_t cycles = 1;
-    /* Negative when the values were collected a little before the cycle was due. */
-    int32_t late_us = (int32_t)(values->status.time_us - telemetry->next_us);
-    if (late_us < -TELEMETRY_CYCLE_US) { /* changed in memory: telemetry_due() */
-        telemetry->next_us = values->status.time_us;
-        late_us = 0;
-    }
-    if (late_us >= TELEMETRY_CYCLE_US) {
-        cycles += (uint32_t)late_us / TELEMETRY_CYCLE_US;
-    }
-    telemetry->next_us += cycles * TELEMETRY_CYCLE_US;
-    telemetry->cycle = (uint8_t)(telemetry->cycle + cycles);
+    telemetry_advance(telemetry, values->status.time_us);
 }
 
 bool telemetry_pauses(telemetry_t *telemetry, uint32_t time_us) {

@@ -67,6 +67,9 @@ static inline bool telemetry_due(const telemetry_t *telemetry, uint32_t time_us)
  * the groups of this cycle that precede the counters. [background] */
 void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values);
 
+/* Sets the time of the next cycle alone, as telemetry_cycle does. time_us: of the values of this one. [background] */
+void telemetry_advance(telemetry_t *telemetry, uint32_t time_us);
+
 /* True while the mailboxes are to run empty, so that the heartbeat leaves. [background] */
 bool telemetry_pauses(telemetry_t *telemetry, uint32_t time_us);
 

@@ -64,11 +64,13 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     parameters_init(&drive->parameters);
     parameters_set_control_rate(&drive->parameters, config->control_rate_hz);
     parameters_set_controller(&drive->parameters, (int32_t)config->controller);
+    parameters_set(&drive->parameters, PARAMETER_PROTOCOL, (int32_t)config->canopen_node);
     if (config->telemetry_period_ms != 0) {
         parameters_set(&drive->parameters, PARAMETER_TELEMETRY_PERIOD_MS, (int32_t)config->telemetry_period_ms);
     }
     nvm_store_init(&drive->store, hal, &drive->parameters);
     comms_init(&drive->comms, config->node, hal_time_us(hal));
+    comms_choose(&drive->comms, drive->parameters.values[PARAMETER_PROTOCOL], hal_time_us(hal));
     drive->thermal.step_us = hal_time_us(hal) - THERMAL_STEP_US / 2u; /* halfway between two telemetry cycles */
     xcp_init(&drive->comms.xcp, drive, DRIVE_WORDS, &drive->sampler);
     table_scale_reset(&drive->table_scale);
@@ -279,7 +281,7 @@ COLD NOINLINE static void send_telemetry(drive_t *drive, hal_t *hal, uint32_t ti
     }
     bus_monitor_step(&drive->comms.bus, hal, time_us);
     if (drive->comms.bus.run_inhibited) {
-        commands_disarm(&drive->comms.commands);
+        comms_bus_off(&drive->comms);
     }
     if (drive->comms.bus.status.state == HAL_CAN_BUS_OFF) {
         arming_end_configuration(&drive->comms.commands.arming);

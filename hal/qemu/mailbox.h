@@ -71,6 +71,7 @@ typedef struct {
     uint32_t controller; /* drive_controller_t */
     uint32_t node;
     uint32_t telemetry_period_ms; /* 0: as the parameter's default */
+    uint32_t canopen_node;        /* 0: the protocol of drive.dbc */
     uint32_t adc_bits;
     uint32_t encoder_bits;
     uint32_t timed; /* 1: instructions take time, 0: they take none */

@@ -18,6 +18,7 @@ from salient.bus.clock import open_bus
 from salient.bus.signals import SignalTable, drive_database
 from salient.config import BenchConfig
 from salient.experiments.scenario import load_scenarios, run_scenario
+from salient.machine.eds import write_eds
 from salient.paths import DRIVE_DBC, ROOT, SCENARIOS
 
 EXAMPLES = ROOT / "tools" / "examples"
@@ -54,6 +55,17 @@ def test_plot_speed_runs_the_drive_and_draws_its_speed(channel, tmp_path):
     rows, columns = curve.nonzero()
     top = columns[rows <= rows.min() + 2]  # at 600 r/min for most of the time
     assert 0.5 < len(set(top)) / (columns.max() - columns.min()) < 0.8
+
+
+@pytest.mark.in_turns
+def test_canopen_speed_runs_the_drive_and_stops_it(channel, tmp_path):
+    write_eds(tmp_path / "drive.eds", "saturating")
+    with EmulatorProcess(BenchConfig(pace="realtime", protocol="canopen"), channel):
+        example = start("canopen_speed.py", str(tmp_path / "drive.eds"), channel)
+        output, errors = example.communicate()
+    assert (errors, example.returncode) == ("", 0)
+    assert any(line.startswith("600 r/min") for line in output.splitlines())
+    assert output.splitlines()[-1] == "stopped"
 
 
 def test_the_script_of_the_quick_start_is_the_example():

@@ -45,6 +45,7 @@ static noreturn void run(void) {
         .controller = (drive_controller_t)mailbox->controller,
         .node = mailbox->node,
         .telemetry_period_ms = mailbox->telemetry_period_ms,
+        .canopen_node = mailbox->canopen_node,
     };
     const bool started = drive_init(&drive, &board, &config);
     board_interrupt_enable();

@@ -177,6 +177,10 @@ def _machine(options: argparse.Namespace) -> int:
         from salient.bench.a2l import write_a2l
 
         write_a2l(options.a2l, options.machine, node=options.node)
+    if options.eds is not None:
+        from salient.machine.eds import write_eds
+
+        write_eds(options.eds, options.machine, options.node)
     return code
 
 

@@ -204,6 +204,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     machine.add_argument("--json", type=Path, metavar="FILE", help="also write the drive's data to a file")
     machine.add_argument("--a2l", type=Path, metavar="FILE.a2l",
                          help="also write the A2L file of its drive, for measurement and calibration tools (XCP)")
+    machine.add_argument("--eds", type=Path, metavar="FILE.eds",
+                         help="also write the electronic data sheet of its drive as a CANopen device")
     machine.add_argument("--dbc", type=Path, metavar="FILE.dbc",
                          help="also write the CAN database of its drive, with the factors and ranges of this machine")
     _add_node(machine)

@@ -20,6 +20,8 @@ from typing import Any
 
 CONTROLLERS = ("traditional", "paper", "salient")
 """Numbered as drive_controller_t of the firmware."""
+PROTOCOLS = ("salient", "canopen")
+"""From 0: protocol_index of the executable's options."""
 HOST_BUILDS = ("host", "debug", "sanitize")
 TARGET_BUILDS = ("cortex-m4", "cortex-m4-O0", "cortex-m4-Os", "rv32")
 """Images for boards of QEMU: Cortex-M4 with -O2, -O0 and -Os, and RV32."""
@@ -209,6 +211,8 @@ class BenchConfig(Conditions):
                         maximum=NODE_MAX, commands=("sim",))
     drives: int = _option(1, INTEGER, "drives on the bus, each on a bench of its own, with ascending node numbers",
                           metavar="N", minimum=1, maximum=NODE_MAX + 1, commands=("sim",))
+    protocol: str = _option("salient", WORD, "protocol on the bus at the start: that of drive.dbc, or CANopen with the "
+                            "node-ID node + 1", metavar="NAME", choices=PROTOCOLS, commands=("sim",))
     telemetry_period_ms: int | None = _option(None, INTEGER, "period of the drive's fast telemetry at the start in ms; "
                                               "without it the default of the parameter", metavar="N", minimum=1,
                                               maximum=100, commands=("sim",))

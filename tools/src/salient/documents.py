@@ -16,9 +16,9 @@ def write_reference() -> None:
     """Writes the reference pages that need no measurement. A measured page names its command."""
     from salient.bench import faults
     from salient.experiments.campaign import report
-    from salient.generate import checkers, commands, parameters, resolution, signals
+    from salient.generate import checkers, commands, objects, parameters, resolution, signals
 
-    for page in (faults, checkers, commands, parameters, resolution, signals):
+    for page in (faults, checkers, commands, objects, parameters, resolution, signals):
         page.main()
     report.write_pages()
 

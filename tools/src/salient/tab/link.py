@@ -24,7 +24,7 @@ _FRAME = struct.Struct("<QIB")
 """Time since the frame before in ns, identifier, length; then the data."""
 _OPTIONS = ("controller", "control_rate_hz", "encoder_bits", "encoder_edges", "adc_bits", "immediate_pwm", "seed",
             "initial_angle_deg", "bit_rate")
-_ONLY_ALONE = ("drive_only", "memory", "node")
+_ONLY_ALONE = ("drive_only", "memory", "node", "protocol")
 """Options that a tab does not have."""
 
 

@@ -1,0 +1,217 @@
+#include "comms/canopen_demand.h"
+
+#include "comms/canopen_units.h"
+#include "comms/units.h"
+#include "control/machine_tables.h"
+#include "fixed/compiler.h"
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+#define HALT 0x0100u
+#define HALT_FAST 2
+#define BITS 16
+#define US_PER_MS 1000u
+#define MILLI 1000
+#define LONG_US 100000000u /* windows are shorter */
+
+/* 2^16 / 10^6, Q20. */
+#define Q16_PER_US_Q20 INT64_C(68719)
+
+static bool is_torque(unsigned mode) {
+    return mode == CANOPEN_MODE_TORQUE || mode == CANOPEN_MODE_CYCLIC_TORQUE || mode == CANOPEN_MODE_NONE;
+}
+
+COLD bool canopen_demand_has_mode(int32_t mode) {
+    return mode == CANOPEN_MODE_NONE || mode == CANOPEN_MODE_VELOCITY || mode == CANOPEN_MODE_TORQUE ||
+           mode == CANOPEN_MODE_CYCLIC_VELOCITY || mode == CANOPEN_MODE_CYCLIC_TORQUE;
+}
+
+static bool is_cyclic(unsigned mode) {
+    return mode == CANOPEN_MODE_CYCLIC_VELOCITY || mode == CANOPEN_MODE_CYCLIC_TORQUE;
+}
+
+static int32_t demand_of(const canopen_drive_t *drive) {
+    return fixed_saturate(fixed_shift(drive->demand_q16, BITS));
+}
+
+static int64_t q16(int32_t milli) {
+    return (int64_t)milli * (INT64_C(1) << BITS);
+}
+
+static int32_t present_speed(const canopen_t *canopen) {
+    return canopen_speed_of_machine(canopen->measured.speed);
+}
+
+static int32_t torque_target(const canopen_t *canopen) {
+    return canopen->values[CANOPEN_VALUE_TARGET_TORQUE] * MILLI; /* of 16 bits */
+}
+
+static void aim(canopen_t *canopen) {
+    canopen_drive_t *drive = &canopen->drive;
+    drive->target = drive->torque ? torque_target(canopen)
+                                  : canopen_velocity_milli(canopen, canopen->values[CANOPEN_VALUE_TARGET_VELOCITY]);
+    drive->left_us = (uint32_t)canopen->values[CANOPEN_VALUE_INTERPOLATION] * US_PER_MS;
+}
+
+COLD void canopen_demand_begin(canopen_t *canopen) {
+    canopen_drive_t *drive = &canopen->drive;
+    drive->mode = (uint8_t)canopen->values[CANOPEN_VALUE_MODE];
+    drive->torque = is_torque(drive->mode);
+    drive->demand_q16 =
+        q16(drive->torque ? canopen_torque_of_q8(canopen->measured.reference_q8) * MILLI : present_speed(canopen));
+    drive->at_rest = false;
+    drive->within_us = 0;
+    aim(canopen);
+}
+
+COLD void canopen_demand_stop(canopen_t *canopen) {
+    canopen_drive_t *drive = &canopen->drive;
+    if (drive->torque) {
+        drive->torque = false;
+        drive->demand_q16 = q16(present_speed(canopen));
+    }
+    drive->at_rest = false;
+}
+
+COLD void canopen_demand_target(canopen_t *canopen, unsigned slot) {
+    const bool torque = canopen->drive.torque;
+    if (slot == (torque ? CANOPEN_VALUE_TARGET_TORQUE : CANOPEN_VALUE_TARGET_VELOCITY)) {
+        aim(canopen);
+    }
+}
+
+COLD bool canopen_demand_rests(const canopen_t *canopen, uint32_t time_us) {
+    const canopen_drive_t *drive = &canopen->drive;
+    return drive->at_rest && (drive->slow_us > 0 || time_us - drive->stopped_us > CANOPEN_STANDSTILL_MAX_US);
+}
+
+/* Moves the demand towards a target by a rate in 0.001 of a unit per second, at most 2^30. */
+static void ramp(canopen_drive_t *drive, int32_t target, int32_t rate, uint32_t elapsed_us) {
+    const int64_t most = fixed_shift((int64_t)rate * elapsed_us * Q16_PER_US_Q20, 20) + 1;
+    const int64_t missing = q16(target) - drive->demand_q16;
+    drive->demand_q16 += fixed_clamp_64(missing, -most, most);
+}
+
+static void interpolate(canopen_drive_t *drive, uint32_t elapsed_us) {
+    if (drive->left_us <= elapsed_us) {
+        drive->left_us = 0;
+        drive->demand_q16 = q16(drive->target);
+        return;
+    }
+    const int64_t missing = q16(drive->target) - drive->demand_q16; /* below 2^49, of time 2^13 */
+    drive->demand_q16 += fixed_divide(missing * elapsed_us, drive->left_us);
+    drive->left_us -= elapsed_us;
+}
+
+static void step_velocity(canopen_t *canopen, uint32_t elapsed_us, bool halted) {
+    canopen_drive_t *drive = &canopen->drive;
+    const bool stops = drive->stopping || halted;
+    const bool fast = drive->stopping ? drive->fast : canopen->values[CANOPEN_VALUE_HALT_OPTION] == HALT_FAST;
+    if (is_cyclic(drive->mode) && !stops) {
+        interpolate(drive, elapsed_us);
+        return;
+    }
+    const int32_t target = stops ? 0 : canopen_velocity_milli(canopen, canopen->values[CANOPEN_VALUE_TARGET_VELOCITY]);
+    const int32_t present = demand_of(drive);
+    const bool slower = fixed_magnitude(target) < fixed_magnitude(present) || (target < 0) != (present < 0);
+    const unsigned rate = stops && fast ? CANOPEN_VALUE_QUICK_STOP_DECELERATION
+                          : slower      ? CANOPEN_VALUE_DECELERATION
+                                        : CANOPEN_VALUE_ACCELERATION;
+    ramp(drive, target, canopen_acceleration_milli(canopen, canopen->values[rate]), elapsed_us);
+}
+
+static void step_torque(canopen_t *canopen, uint32_t elapsed_us, bool halted) {
+    canopen_drive_t *drive = &canopen->drive;
+    if (drive->mode == CANOPEN_MODE_CYCLIC_TORQUE && !halted) {
+        interpolate(drive, elapsed_us);
+        return;
+    }
+    const int32_t target = halted || drive->mode == CANOPEN_MODE_NONE ? 0 : torque_target(canopen);
+    ramp(drive, target, fixed_clamp(canopen->values[CANOPEN_VALUE_TORQUE_SLOPE], 1, MILLI * MILLI) * MILLI, elapsed_us);
+}
+
+static uint32_t longer(uint32_t time_us, uint32_t elapsed_us, bool holds) {
+    return holds ? fixed_min_u32(time_us + elapsed_us, LONG_US) : 0;
+}
+
+/* Times for which the velocity is within the window of the profile, and below the threshold. */
+static void watch(canopen_t *canopen, uint32_t elapsed_us, bool halted) {
+    canopen_drive_t *drive = &canopen->drive;
+    const int32_t velocity = canopen_velocity(canopen, present_speed(canopen));
+    const int32_t target = halted || drive->stopping ? 0 : canopen->values[CANOPEN_VALUE_TARGET_VELOCITY];
+    const uint32_t away = fixed_magnitude(fixed_subtract(velocity, target));
+    drive->within_us =
+        longer(drive->within_us, elapsed_us, away <= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_WINDOW]);
+    drive->slow_us = longer(drive->slow_us, elapsed_us,
+                            fixed_magnitude(velocity) <= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_THRESHOLD]);
+}
+
+static bool is_halted(const canopen_t *canopen) {
+    return ((uint32_t)canopen->values[CANOPEN_VALUE_CONTROLWORD] & HALT) != 0;
+}
+
+COLD void canopen_demand_step(canopen_t *canopen, uint32_t time_us) {
+    canopen_drive_t *drive = &canopen->drive;
+    const uint32_t elapsed_us = fixed_min_u32(time_us - drive->step_us, CANOPEN_STEP_MAX_US);
+    drive->step_us = time_us;
+    watch(canopen, elapsed_us, is_halted(canopen));
+    if (!canopen_enabled(canopen)) {
+        drive->mode = (uint8_t)canopen->values[CANOPEN_VALUE_MODE];
+        drive->demand_q16 = 0;
+        drive->limited = false;
+        return;
+    }
+    if (!drive->stopping && drive->mode != canopen->values[CANOPEN_VALUE_MODE]) {
+        canopen_demand_begin(canopen);
+    }
+    if (drive->torque) {
+        step_torque(canopen, elapsed_us, is_halted(canopen));
+    } else {
+        step_velocity(canopen, elapsed_us, is_halted(canopen));
+    }
+    if (drive->stopping && !drive->at_rest && demand_of(drive) == 0) {
+        drive->at_rest = true;
+        drive->stopped_us = time_us;
+    }
+}
+
+COLD void canopen_demand_command(canopen_t *canopen, command_t *command) {
+    canopen_drive_t *drive = &canopen->drive;
+    const int32_t demand = demand_of(drive);
+    if (drive->torque) {
+        command->mode = DRIVE_MODE_TORQUE;
+        command->torque_reference_q24 = canopen_torque_q24(demand);
+        drive->limited = false;
+        return;
+    }
+    const int32_t most = machine_tables.speed_reference_max, wanted = canopen_machine_speed(demand);
+    const int32_t within = fixed_clamp(wanted, -most, most);
+    drive->limited = within != wanted;
+    command->mode = DRIVE_MODE_SPEED;
+    command->speed_reference_q22 = units_speed_q22(within);
+}
+
+COLD int32_t canopen_demand_velocity(const canopen_t *canopen) {
+    return canopen->drive.torque ? 0 : demand_of(&canopen->drive);
+}
+
+COLD bool canopen_demand_reached(const canopen_t *canopen) {
+    const canopen_drive_t *drive = &canopen->drive;
+    if (drive->state != CANOPEN_OPERATION_ENABLED) {
+        return drive->state == CANOPEN_QUICK_STOP_ACTIVE && drive->at_rest;
+    }
+    if (drive->mode == CANOPEN_MODE_TORQUE && drive->torque) {
+        return demand_of(drive) == (is_halted(canopen) ? 0 : torque_target(canopen));
+    }
+    return drive->mode == CANOPEN_MODE_VELOCITY &&
+           drive->within_us >= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_WINDOW_TIME] * US_PER_MS;
+}
+
+COLD bool canopen_demand_slow_or_followed(const canopen_t *canopen) {
+    const canopen_drive_t *drive = &canopen->drive;
+    if (is_cyclic(drive->mode)) {
+        return drive->state == CANOPEN_OPERATION_ENABLED && !drive->stopping && !is_halted(canopen);
+    }
+    return drive->mode == CANOPEN_MODE_VELOCITY &&
+           drive->slow_us >= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_THRESHOLD_TIME] * US_PER_MS;
+}

@@ -1,0 +1,282 @@
+// PDOs: default and random mapping, transmission types, timers; NMT, heartbeat, guarding, SYNC and LSS byte by byte.
+#include "support/canopen_bench.h"
+
+#include <algorithm>
+#include <random>
+
+namespace {
+
+using namespace canopen_bench;
+
+class CanopenPdo : public CanopenBench {
+  protected:
+    // Maps objects (index, sub) to a PDO; the abort code of the last step.
+    uint32_t map(unsigned communication, unsigned mapping, const std::vector<canopen_object_t> &objects,
+                 unsigned type = 255) {
+        const uint32_t id = read(communication, 1) & 0x7FFu;
+        EXPECT_EQ(write(communication, 1, int32_t(0x80000000u | id)), 0u);
+        EXPECT_EQ(write(communication, 2, int32_t(type)), 0u);
+        EXPECT_EQ(write(mapping, 0, 0), 0u);
+        for (unsigned i = 0; i < objects.size(); i++) {
+            const canopen_object_t &of = objects[i];
+            const uint32_t bits = 8u * canopen_bytes(&of);
+            EXPECT_EQ(write(mapping, i + 1, int32_t(uint32_t(of.index) << 16 | uint32_t(of.sub) << 8 | bits)), 0u);
+        }
+        const uint32_t refused = write(mapping, 0, int32_t(objects.size()));
+        EXPECT_EQ(write(communication, 1, int32_t(id)), 0u);
+        return refused;
+    }
+
+    std::vector<canopen_object_t> mappable(unsigned access) {
+        std::vector<canopen_object_t> found;
+        for (unsigned index = 0x1000; index < 0x7000; index++) {
+            canopen_object_t object;
+            if (canopen_find(index, 0, &object) == CANOPEN_DONE && (object.row.access & access) != 0) {
+                found.push_back(object);
+            }
+        }
+        return found;
+    }
+};
+
+TEST_F(CanopenPdo, nothing_is_taken_or_sent_before_operational) {
+    receive(0x200 + NODE, {6, 0});
+    receive(0x80, {});
+    cycle(5);
+    EXPECT_TRUE(sent().empty());
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED);
+    operational();
+    cycle();
+    const auto frames = sent();
+    ASSERT_EQ(frames.size(), 4u) << "each once";
+    EXPECT_EQ(frames[0], (sent_t{0x180 + NODE, {0x50, 0x02}}));
+    EXPECT_EQ(frames[1], (sent_t{0x280 + NODE, {0x50, 0x02, 3}}));
+    cycle(20); // standstill and velocity reached
+    sent();
+    cycle(50);
+    EXPECT_TRUE(sent().empty()) << "no change";
+    receive(0x200 + NODE, {6, 0});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_READY_TO_SWITCH_ON);
+    cycle();
+    EXPECT_EQ(sent().front(), (sent_t{0x180 + NODE, {0x31, 0x12}}));
+}
+
+TEST_F(CanopenPdo, mapping_is_changed_by_the_procedure_of_the_standard_alone) {
+    EXPECT_EQ(write(0x1A00, 0, 0), 0x08000022u) << "valid";
+    EXPECT_EQ(write(0x1800, 1, 0x1A5), 0x08000022u) << "another identifier while valid";
+    EXPECT_EQ(write(0x1800, 1, int32_t(0x80000000u | 0x1A5)), 0u);
+    EXPECT_EQ(write(0x1A00, 1, 0x606C0020), 0x08000022u) << "counted";
+    EXPECT_EQ(write(0x1A00, 0, 0), 0u);
+    EXPECT_EQ(write(0x1A00, 1, 0x60FF0010), 0x06040042u) << "not its length";
+    EXPECT_EQ(write(0x1A00, 1, 0x60830020), 0u);
+    EXPECT_EQ(write(0x1A00, 1, 0x10170010), 0x06040041u) << "not mappable";
+    EXPECT_EQ(write(0x1A00, 1, 0x50000010), 0x06020000u) << "no object";
+    EXPECT_EQ(write(0x1600, 1, 0x60410010), 0x08000022u);
+    for (unsigned sub : {1u, 2u, 3u}) {
+        EXPECT_EQ(write(0x1A00, sub, 0x606C0020), 0u);
+    }
+    EXPECT_EQ(write(0x1A00, 0, 3), 0x06040042u) << "twelve bytes";
+    EXPECT_EQ(write(0x1A00, 0, 2), 0u);
+    EXPECT_EQ(write(0x1A00, 0, 4), 0x06020000u) << "one of nothing";
+    EXPECT_EQ(write(0x1400, 1, int32_t(0x80000000u | 0x205)), 0u);
+    EXPECT_EQ(write(0x1600, 0, 0), 0u);
+    EXPECT_EQ(write(0x1600, 2, 0x60400010), 0u);
+    EXPECT_EQ(write(0x1600, 0, 2), 0x06040043u) << "the controlword twice";
+    for (int32_t id : {0x0, 0x7F, 0x80, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x701, 0x7FF}) {
+        EXPECT_EQ(write(0x1800, 1, int32_t(0x80000000u) | id), 0x06090030u) << id;
+    }
+    EXPECT_EQ(write(0x1800, 1, int32_t(0x20000181)), 0x06090030u) << "29 bits";
+    EXPECT_EQ(write(0x1800, 2, 241), 0x06090030u);
+}
+
+TEST_F(CanopenPdo, random_mapping_carries_the_values_of_the_objects) {
+    std::mt19937 random(4711);
+    const auto receivable = mappable(CANOPEN_RPDO), transmittable = mappable(CANOPEN_TPDO);
+    ASSERT_GT(receivable.size(), 8u);
+    ASSERT_GT(transmittable.size(), PARAMETER_COUNT + 8u);
+    operational();
+    for (unsigned round = 0; round < 300; round++) {
+        const unsigned pdo = unsigned(random() % 4);
+        for (bool receives : {true, false}) {
+            const auto &all = receives ? receivable : transmittable;
+            std::vector<canopen_object_t> chosen;
+            unsigned bytes = 0;
+            for (unsigned tries = 0; tries < 12 && chosen.size() < 8; tries++) {
+                const canopen_object_t &object = all[random() % all.size()];
+                const bool twice = receives && std::any_of(chosen.begin(), chosen.end(), [&](const auto &other) {
+                                       return other.index == object.index;
+                                   });
+                if (bytes + canopen_bytes(&object) <= 8 && !twice && object.index != 0x6040) {
+                    chosen.push_back(object);
+                    bytes += canopen_bytes(&object);
+                }
+            }
+            ASSERT_EQ(
+                map((receives ? 0x1400 : 0x1800) + pdo, (receives ? 0x1600 : 0x1A00) + pdo, chosen, receives ? 255 : 1),
+                0u);
+            sent();
+            if (!receives) {
+                cycle();
+                sent();
+                receive(0x80, {});
+                const auto frames = sent();
+                const auto frame = std::find_if(frames.begin(), frames.end(), [&](const sent_t &one) {
+                    return one.identifier == 0x180 + 0x100 * pdo + NODE;
+                });
+                ASSERT_NE(frame, frames.end());
+                bytes_t expected;
+                for (const auto &object : chosen) {
+                    const bytes_t response = sdo(head(0x40, object.index, object.sub));
+                    expected.insert(expected.end(), response.begin() + 4,
+                                    response.begin() + 4 + canopen_bytes(&object));
+                }
+                EXPECT_EQ(frame->data, expected);
+                continue;
+            }
+            // Values within their limits are taken, all of them; one beyond, and none is.
+            bytes_t data;
+            std::vector<int32_t> wanted, before;
+            bool good = true;
+            for (const auto &object : chosen) {
+                const int32_t low = object.row.minimum, high = object.row.maximum;
+                const int32_t value = random() % 8 == 0 ? int32_t(random()) : random() % 2 ? low : high;
+                uint8_t raw[4];
+                canopen_pack(raw, canopen_bytes(&object), value);
+                data.insert(data.end(), raw, raw + canopen_bytes(&object));
+                wanted.push_back(canopen_unpack(&object, raw));
+                good = good && canopen_check(&canopen, &object, wanted.back()) == CANOPEN_DONE;
+                before.push_back(canopen_unpack(&object, sdo(head(0x40, object.index, 0)).data() + 4));
+            }
+            receive(0x200 + 0x100 * pdo + NODE, data);
+            for (unsigned i = 0; i < chosen.size(); i++) {
+                const bytes_t now = sdo(head(0x40, chosen[i].index, 0));
+                EXPECT_EQ(canopen_unpack(&chosen[i], now.data() + 4), good ? wanted[i] : before[i]) << round;
+            }
+        }
+    }
+}
+
+TEST_F(CanopenPdo, the_controlword_of_a_frame_finds_its_mode_and_reference) {
+    canopen_object_t word, mode, target;
+    canopen_find(0x6040, 0, &word);
+    canopen_find(0x6060, 0, &mode);
+    canopen_find(0x60FF, 0, &target);
+    operational();
+    ASSERT_EQ(map(0x1402, 0x1602, {word, mode, target}), 0u);
+    receive(0x400 + NODE, {6, 0, 9, 0x58, 2, 0, 0});
+    receive(0x400 + NODE, {15, 0, 9, 0x58, 2, 0, 0});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
+    EXPECT_EQ(canopen.drive.mode, 9);
+    EXPECT_EQ(canopen.drive.target, 600000);
+    receive(0x400 + NODE, {0, 0, 2, 1, 0, 0, 0});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED) << "a mode that it has not: nothing is taken";
+    cycle();
+    sent();
+    receive(0x400 + NODE, {0, 0});
+    cycle();
+    EXPECT_EQ(sent().front(), (sent_t{0x80 + NODE, {0x10, 0x82, 0, 0, 0, 0, 0, 0}})) << "short";
+    EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
+    receive(0x400 + NODE, {0, 0, 9, 1, 0, 0, 0, 0});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "long: its begin counts";
+}
+
+TEST_F(CanopenPdo, transmission_types_and_timers) {
+    operational();
+    cycle();
+    sent();
+    const auto count = [&](unsigned pdo) {
+        const auto frames = sent();
+        return std::count_if(frames.begin(), frames.end(),
+                             [&](const sent_t &one) { return one.identifier == 0x180 + 0x100 * pdo + NODE; });
+    };
+    write(0x1800, 2, 3);
+    for (unsigned i = 0; i < 9; i++) {
+        receive(0x80, {});
+    }
+    EXPECT_EQ(count(0), 3) << "every third SYNC";
+    write(0x1801, 2, 0);
+    cycle();
+    receive(0x80, {});
+    EXPECT_EQ(count(1), 1);
+    receive(0x80, {});
+    EXPECT_EQ(count(1), 0) << "no change";
+    write(0x1802, 5, 20);
+    cycle(200);
+    EXPECT_NEAR(double(count(2)), 10, 1) << "event timer";
+    for (unsigned i = 0; i < 100; i++) {
+        values.motion.speed_rpm += 1000;
+        cycle();
+        if (i % 10 == 9) {
+            EXPECT_LE(count(2), 1) << "inhibit time";
+        }
+    }
+    write(0x1400, 2, 1);
+    receive(0x200 + NODE, {6, 0});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED);
+    receive(0x80, {});
+    EXPECT_EQ(canopen.drive.state, CANOPEN_READY_TO_SWITCH_ON) << "with the SYNC";
+}
+
+TEST_F(CanopenPdo, nmt_heartbeat_and_guarding) {
+    EXPECT_EQ(canopen.nmt, CANOPEN_NMT_PRE_OPERATIONAL);
+    write(0x1017, 0, 10);
+    cycle(10);
+    EXPECT_EQ(sent().back(), (sent_t{0x700 + NODE, {127}}));
+    receive(0, {1, NODE + 1});
+    EXPECT_EQ(canopen.nmt, CANOPEN_NMT_PRE_OPERATIONAL) << "of another node";
+    receive(0, {2, NODE});
+    EXPECT_EQ(canopen.nmt, CANOPEN_NMT_STOPPED);
+    EXPECT_EQ(sdo(head(0x40, 0x1000, 0)), bytes_t{}) << "no SDO";
+    cycle(10);
+    EXPECT_EQ(sent().back(), (sent_t{0x700 + NODE, {4}}));
+    receive(0x700 + NODE, {}, true);
+    EXPECT_TRUE(sent().empty()) << "heartbeat or guarding";
+    receive(0, {130, 0});
+    cycle();
+    EXPECT_EQ(sent().front(), (sent_t{0x700 + NODE, {0}}));
+    for (unsigned toggle : {0x00u, 0x80u, 0x00u}) {
+        receive(0x700 + NODE, {}, true);
+        EXPECT_EQ(sent().front(), (sent_t{0x700 + NODE, {uint8_t(toggle | 127)}}));
+    }
+}
+
+TEST_F(CanopenPdo, lss_selects_and_sets_the_node) {
+    const auto lss = [&](unsigned command, uint32_t value) {
+        receive(0x7E5, {uint8_t(command), uint8_t(value), uint8_t(value >> 8), uint8_t(value >> 16),
+                        uint8_t(value >> 24), 0, 0, 0});
+        const auto frames = sent();
+        return frames.empty() ? bytes_t{} : frames[0].data;
+    };
+    const uint32_t identity[] = {CANOPEN_VENDOR, CANOPEN_PRODUCT, machine_tables.machine_hash, 1};
+    EXPECT_EQ(lss(0x5E, 0), bytes_t{}) << "not selected";
+    for (unsigned wrong = 0; wrong < 5; wrong++) {
+        bytes_t response;
+        for (unsigned i = 0; i < 4; i++) {
+            response = lss(0x40 + i, identity[i] + (i == wrong ? 1 : 0));
+        }
+        EXPECT_EQ(response.empty(), wrong < 4) << wrong;
+    }
+    EXPECT_EQ(lss(0x5E, 0)[1], NODE);
+    EXPECT_EQ(lss(0x11, 0)[1], 1) << "no node-ID";
+    EXPECT_EQ(lss(0x11, 128)[1], 1);
+    EXPECT_EQ(lss(0x11, 42)[1], 0);
+    EXPECT_EQ(lss(0x13, 0)[1], 1) << "bit rate";
+    EXPECT_EQ(lss(0x17, 0)[1], 0);
+    EXPECT_EQ(parameters.values[PARAMETER_PROTOCOL], 42);
+    EXPECT_EQ(canopen.node, NODE);
+    receive(0, {130, 0});
+    cycle();
+    EXPECT_EQ(sent().front(), (sent_t{0x700 + 42, {0}}));
+    const uint32_t range[] = {identity[0], identity[1], identity[2], identity[2], 0, 5};
+    bytes_t response;
+    for (unsigned i = 0; i < 6; i++) {
+        response = lss(0x46 + i, range[i]);
+    }
+    EXPECT_EQ(response[0], 0x4F);
+    for (unsigned i = 0; i < 6; i++) {
+        response = lss(0x46 + i, i == 4 ? 2 : range[i]);
+    }
+    EXPECT_EQ(response, bytes_t{});
+}
+
+} // namespace
