@@ -3,6 +3,7 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "interrupts/deferred_jobs.h"
+#include "interrupts/position_control.h"
 #include "interrupts/speed_control.h"
 #include "interrupts/torque_control.h"
 
@@ -407,7 +408,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
-    speed_control_deferred(parameters, deferred, input, command, state->torque_limit_q24, results);
+    position_control_deferred(parameters, state, input, command, results);
     follow_innovation(parameters, deferred, input, results);
     deferred->run = input->run;
     if (!input->run) {

@@ -2,7 +2,7 @@
  *
  * A position is absolute over any number of turns, from the zero that the homing has set, or until then from the zero
  * of the encoder in the turn of the start. Forward rotation counts up. It has 2^-32 revolutions in 64 bits;
- * POSITION_MAX bounds set points to +-16384 revolutions, of which every difference fits.
+ * POSITION_MAX bounds set points to +-8192 revolutions, of which every difference fits.
  */
 #ifndef CONTROL_POSITION_POSITION_H
 #define CONTROL_POSITION_POSITION_H
@@ -11,7 +11,7 @@
 #include <stdint.h>
 
 #define POSITION_ONE_REV (INT64_C(1) << 32)
-#define POSITION_MAX (POSITION_ONE_REV << 14)
+#define POSITION_MAX (POSITION_ONE_REV << 13)
 
 /* What the drive does with a set point while it runs in position mode. */
 typedef enum {
@@ -27,7 +27,7 @@ typedef enum {
     POSITION_HOMING_INDEX_BACKWARD, /* backwards */
     POSITION_HOMING_STOP_FORWARD,   /* a mechanical stop, found by its torque, forwards */
     POSITION_HOMING_STOP_BACKWARD,  /* backwards */
-    POSITION_HOMING_METHODS
+    POSITION_HOMING_METHODS         /* of a set point: that of the parameter homing_method */
 } position_homing_t;
 
 /* Written by the background with the interrupts masked. Values beyond their range are limited to it; a limit of 0 is
