@@ -163,6 +163,8 @@ typedef struct {
     int32_t approached_q22;           /* speed reference, rad/s, Q9.22 */
     uint32_t updates_since_near;      /* since the speed was first near it */
     bool approaches_reference;        /* until then, and for some more */
+    bool follows_position;            /* position mode, in which the next one takes the place of this */
+    bool accelerates;                 /* the position reference does */
     slow_counts_t slow_counts;
     count_course_t count_course;
     bp_tuner_t tuner;

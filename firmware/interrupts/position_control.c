@@ -4,6 +4,9 @@
 #include "fixed/fixed.h"
 #include "interrupts/speed_control.h"
 
+/* Part of the largest torque that an acceleration asks for from which on it shows the inertia. */
+#define ACCELERATION_SHARE 32
+
 static int32_t torque_limit_q24(const control_parameters_t *parameters, const control_state_t *state) {
     const int32_t limit_q24 = state->torque_limit_q24;
     return position_seeks_stop(&state->position) ? fixed_min(limit_q24, parameters->position.homing_torque_q24)
@@ -27,6 +30,8 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
         .request = COMMAND_RUN, .mode = DRIVE_MODE_SPEED, .speed_reference_q22 = output.speed_q22};
     deferred->speed_reference_q22 = speed_control_limited_q22(parameters, output.speed_q22); /* no ramp */
     deferred->run = true;
+    deferred->follows_position = true;
+    deferred->accelerates = fixed_abs(output.torque_q24) >= parameters->conduction.torque_max_q24 / ACCELERATION_SHARE;
     speed_control_deferred(parameters, deferred, input, &command, limit_q24, results);
     results->speed.speed_law_torque_q24 =
         fixed_add(results->speed.speed_law_torque_q24, for_inertia_q24(deferred, output.torque_q24));
@@ -49,6 +54,7 @@ void position_control_deferred(const control_parameters_t *parameters, control_s
         control_position(parameters, state, input, &sample, results);
         return;
     }
+    state->deferred.follows_position = false;
     position_follow(&state->position, &sample);
     speed_control_deferred(parameters, &state->deferred, input, command, state->torque_limit_q24, results);
 }

@@ -14,6 +14,10 @@ static int64_t limited(int64_t position) {
     return fixed_clamp_64(position, -POSITION_MAX, POSITION_MAX);
 }
 
+static int64_t to_profile(int64_t position) {
+    return position * (1 << TO_PROFILE);
+}
+
 /* 2^-32 rev, limited. */
 static int64_t present(const position_t *position, const position_sample_t *sample) {
     const int64_t counted = position->counted + (int32_t)(sample->angle - sample->encoder_angle);
@@ -52,7 +56,7 @@ void position_follow(position_t *position, const position_sample_t *sample) {
 /* The reference is where the rotor is and as fast as it. */
 static void begin_here(position_t *position, const position_sample_t *sample) {
     const int64_t speed = sample->speed > STANDS || sample->speed < -STANDS ? sample->speed : 0;
-    profile_begin_moving(&position->profile, position->status.position << TO_PROFILE, speed);
+    profile_begin_moving(&position->profile, to_profile(position->status.position), speed);
     position->phase = 0;
     position->cubic_ticks = 0;
     position->stops = false;
@@ -74,7 +78,7 @@ static void go_to(const position_parameters_t *parameters, position_t *position,
 /* Calls the place `here` (counted, 2^-32 rev) by a name, and moves the reference with it. */
 static void set_zero(position_t *position, int64_t here, int64_t name) {
     const int64_t zero = here - name;
-    const int64_t moved = (position->zero - zero) * (1 << TO_PROFILE);
+    const int64_t moved = to_profile(position->zero - zero);
     position->zero = zero;
     position->profile.start.x += moved;
     position->profile.end.x += moved;
@@ -133,8 +137,8 @@ static void seek(position_t *position, const position_set_point_t *set_point, co
     }
 }
 
-static void home(const position_parameters_t *parameters, position_t *position, const position_command_t *command,
-                 const position_sample_t *sample, bool begins) {
+static void home(position_t *position, const position_command_t *command, const position_sample_t *sample,
+                 bool begins) {
     const position_set_point_t *set_point = &command->set_point;
     if (begins) {
         begin_homing(position, set_point);
@@ -144,7 +148,7 @@ static void home(const position_parameters_t *parameters, position_t *position, 
         seek(position, set_point, sample);
         break;
     case POSITION_HOMING_RETURNS:
-        position->target = limited(set_point->target) * (1 << TO_PROFILE);
+        position->target = to_profile(limited(set_point->target));
         position->stops = false;
         if (profile_arrived(&position->profile, position->target)) {
             end_homing(position, true);
@@ -155,7 +159,6 @@ static void home(const position_parameters_t *parameters, position_t *position, 
         stop(position, &command->limits);
         break;
     }
-    (void)parameters;
 }
 
 /* a0 and q of the cubic from the reference to a position with a speed; false when it exceeds the limits. */
@@ -199,7 +202,7 @@ static int64_t speed_of_targets(const position_parameters_t *parameters, const p
 
 static void follow_targets(const position_parameters_t *parameters, position_t *position,
                            const position_command_t *command, bool begins) {
-    const int64_t to = limited(command->set_point.target) * (1 << TO_PROFILE);
+    const int64_t to = to_profile(limited(command->set_point.target));
     if (begins) {
         position->targets = 0;
         position->silent_ticks = 0;
@@ -236,7 +239,7 @@ static void follow_targets(const position_parameters_t *parameters, position_t *
 static void check_following(const position_parameters_t *parameters, position_t *position,
                             const position_sample_t *sample) {
     position_status_t *status = &position->status;
-    const int64_t error = position->profile.start.x - (status->position << TO_PROFILE);
+    const int64_t error = position->profile.start.x - to_profile(status->position);
     const bool beyond = error > parameters->following_error || error < -parameters->following_error;
     if (beyond && !status->following_error && !position_seeks_stop(position)) {
         status->following_error = true;
@@ -266,9 +269,9 @@ static void decide(const position_parameters_t *parameters, position_t *position
     } else if (set_point->order == POSITION_ORDER_CYCLIC) {
         follow_targets(parameters, position, command, begins);
     } else if (set_point->order == POSITION_ORDER_HOME) {
-        home(parameters, position, command, sample, begins);
+        home(position, command, sample, begins);
     } else {
-        go_to(parameters, position, limited(set_point->target) * (1 << TO_PROFILE));
+        go_to(parameters, position, to_profile(limited(set_point->target)));
     }
     if (set_point->order != POSITION_ORDER_CYCLIC || position->status.following_error) {
         position->cubic_ticks = 0;
@@ -312,7 +315,7 @@ static position_output_t output(const position_parameters_t *parameters, positio
     position_status_t *status = &position->status;
     const uint32_t part_q16 = (uint32_t)((uint64_t)position->phase * parameters->part_per_period_q32 >> 16);
     const profile_state_t state = profile_at(&position->profile, fixed_min_u32(part_q16, UINT16_MAX));
-    const int64_t error = state.x - (status->position << TO_PROFILE);
+    const int64_t error = state.x - to_profile(status->position);
     const bool cyclic = position->order == POSITION_ORDER_CYCLIC && !position->stops;
     status->reference = state.x >> TO_PROFILE;
     status->error = fixed_saturate(error >> TO_PROFILE);
