@@ -47,6 +47,7 @@ void position_control_deferred(const control_parameters_t *parameters, control_s
         .angle = input->angle,
         .speed = (input->speed_q22 >> 4) * (parameters->position.per_speed_q16 >> 4) >> 8,
         .at_torque_limit = fixed_abs(input->torque_reference_q24) >= limit_q24 - limit_q24 / 16,
+        .count = state->deferred.slow_counts.slow ? 2 * parameters->encoder_middle : 0,
         .periods = input->periods,
     };
     if (input->run && command->mode == DRIVE_MODE_POSITION && command->request == COMMAND_RUN &&

@@ -241,8 +241,8 @@ static void check_following(const position_parameters_t *parameters, position_t 
     position_status_t *status = &position->status;
     const int64_t error = position->profile.start.x - to_profile(status->position);
     const bool beyond = error > parameters->following_error || error < -parameters->following_error;
-    if (beyond && !status->following_error && !position_seeks_stop(position)) {
-        status->following_error = true;
+    if (beyond && !position_seeks_stop(position)) {
+        status->following_error = true; /* once more beyond: the reference begins once more */
         end_homing(position, position->homing == POSITION_HOMING_IDLE && !status->homing_failed);
         begin_here(position, sample);
     }
@@ -261,7 +261,7 @@ static void decide(const position_parameters_t *parameters, position_t *position
     if (begins && position->homing != POSITION_HOMING_IDLE) {
         end_homing(position, false);
     }
-    if (set_point->order == POSITION_ORDER_HALT) {
+    if (begins && set_point->order == POSITION_ORDER_HALT) {
         position->status.following_error = false;
     }
     if (position->status.following_error || set_point->order == POSITION_ORDER_HALT) {
@@ -310,12 +310,21 @@ static profile_limits_t limits_of(const position_parameters_t *parameters, const
     return limits;
 }
 
+/* Error of a reference at rest: of the count, none within it. */
+static int64_t error_of_count(const position_t *position, const position_sample_t *sample, int64_t reference) {
+    const int64_t begin = to_profile(position->counted - position->zero);
+    const int64_t end = begin + to_profile(sample->count);
+    return reference - fixed_clamp_64(reference, begin, end);
+}
+
 static position_output_t output(const position_parameters_t *parameters, position_t *position,
-                                const position_command_t *command) {
+                                const position_command_t *command, const position_sample_t *sample) {
     position_status_t *status = &position->status;
     const uint32_t part_q16 = (uint32_t)((uint64_t)position->phase * parameters->part_per_period_q32 >> 16);
     const profile_state_t state = profile_at(&position->profile, fixed_min_u32(part_q16, UINT16_MAX));
-    const int64_t error = state.x - to_profile(status->position);
+    const bool rests = state.v == 0 && state.a == 0;
+    const int64_t error = sample->count != 0 && rests ? error_of_count(position, sample, state.x)
+                                                      : state.x - to_profile(status->position);
     const bool cyclic = position->order == POSITION_ORDER_CYCLIC && !position->stops;
     status->reference = state.x >> TO_PROFILE;
     status->error = fixed_saturate(error >> TO_PROFILE);
@@ -353,5 +362,5 @@ position_output_t position_step(const position_parameters_t *parameters, positio
         const profile_limits_t limits = limits_of(parameters, position, command);
         profile_search(&limits, &position->profile, position->target);
     }
-    return output(parameters, position, command);
+    return output(parameters, position, command, sample);
 }

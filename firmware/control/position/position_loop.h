@@ -18,6 +18,9 @@
  * profile moves at homing_speed_rpm until the place is found, which then is called the target; to the zero of the
  * encoder it returns
  *
+ * Between slow counts (slow_counts.h) a reference at rest is reached by a rotor within its count: what the model says
+ * of the angle in it would move the rotor from edge to edge.
+ *
  * An error beyond following_error_deg for a tick is a controlled stop: the reference continues from where the rotor is,
  * and stops. Orders have no effect until a halt, or the end of the run, has acknowledged it. The drive itself is not in
  * doubt: what blocks or drives the rotor beyond its torque is the affair of the monitors of shaft, encoder and speed.
@@ -90,6 +93,7 @@ typedef struct {
     uint32_t angle;         /* observer, 2^-32 rev */
     int64_t speed;          /* 2^-48 rev per tick */
     bool at_torque_limit;
+    uint32_t count;   /* 2^-32 rev, while the angle within it is one of the model alone; else 0 */
     uint32_t periods; /* since the last step */
 } position_sample_t;
 
