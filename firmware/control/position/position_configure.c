@@ -11,13 +11,13 @@
 
 #define REV (INT64_C(1) << PROFILE_FRACTION_BITS)
 
-static int64_t saturated(int64_t value, int64_t factor) {
+COLD NOINLINE static int64_t saturated(int64_t value, int64_t factor) {
     int64_t product;
     return __builtin_mul_overflow(value, factor, &product) ? PROFILE_SPEED_MAX : product;
 }
 
 /* r/min in the unit of the machine; 0 for a negative one. */
-static int64_t in_unit(int32_t value, unsigned speed_exponent, int64_t factor) {
+COLD NOINLINE static int64_t in_unit(int32_t value, unsigned speed_exponent, int64_t factor) {
     return saturated((int64_t)fixed_max(value, 0) << speed_exponent, factor);
 }
 
@@ -34,7 +34,7 @@ static int64_t per_speed_q16(const position_settings_t *settings) {
     return (int64_t)settings->angle_step_q32 * (settings->control_rate_hz / PROFILE_TICK_HZ);
 }
 
-static profile_limits_t limits_from(const position_settings_t *settings) {
+COLD static profile_limits_t limits_from(const position_settings_t *settings) {
     const unsigned exponent = settings->speed_exponent;
     const int64_t per_q16 = per_speed_q16(settings);
     const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
@@ -49,7 +49,7 @@ static profile_limits_t limits_from(const position_settings_t *settings) {
     return profile_limits(smaller(either(speed, speed_max), speed_max), up, down, jerk);
 }
 
-static void set_scales(const position_settings_t *settings, position_parameters_t *position) {
+COLD static void set_scales(const position_settings_t *settings, position_parameters_t *position) {
     const int64_t per_q16 = per_speed_q16(settings);
     const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
     /* To speed: 2^16 / per_q16. To torque: the speed that an acceleration adds in a period, by that of an LSB. */

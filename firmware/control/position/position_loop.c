@@ -1,5 +1,6 @@
 #include "control/position/position_loop.h"
 
+#include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
 /* Ticks at the torque limit and without motion that are a mechanical stop: 50 ms. */
@@ -54,7 +55,7 @@ void position_follow(position_t *position, const position_sample_t *sample) {
 }
 
 /* The reference is where the rotor is and as fast as it. */
-static void begin_here(position_t *position, const position_sample_t *sample) {
+COLD NOINLINE static void begin_here(position_t *position, const position_sample_t *sample) {
     const int64_t speed = sample->speed > STANDS || sample->speed < -STANDS ? sample->speed : 0;
     profile_begin_moving(&position->profile, to_profile(position->status.position), speed);
     position->phase = 0;
@@ -62,7 +63,7 @@ static void begin_here(position_t *position, const position_sample_t *sample) {
     position->stops = false;
 }
 
-static void stop(position_t *position, const profile_limits_t *limits) {
+COLD NOINLINE static void stop(position_t *position, const profile_limits_t *limits) {
     if (!position->stops) {
         position->target = profile_stop(limits, &position->profile.end);
         position->stops = true;
@@ -76,7 +77,7 @@ static void go_to(const position_parameters_t *parameters, position_t *position,
 }
 
 /* Calls the place `here` (counted, 2^-32 rev) by a name, and moves the reference with it. */
-static void set_zero(position_t *position, int64_t here, int64_t name) {
+COLD NOINLINE static void set_zero(position_t *position, int64_t here, int64_t name) {
     const int64_t zero = here - name;
     const int64_t moved = to_profile(position->zero - zero);
     position->zero = zero;
@@ -92,7 +93,7 @@ static void end_homing(position_t *position, bool found) {
     position->status.homing_failed = !found;
 }
 
-static void begin_homing(position_t *position, const position_set_point_t *set_point) {
+COLD static void begin_homing(position_t *position, const position_set_point_t *set_point) {
     position->status.homed = position->status.homing_failed = false;
     position->homing = POSITION_HOMING_SEEKS;
     position->turn = position->counted >> 32;
@@ -111,7 +112,7 @@ static bool blocked(position_t *position, const position_sample_t *sample) {
     return position->blocked_ticks >= BLOCKED_TICKS;
 }
 
-static void seek(position_t *position, const position_set_point_t *set_point, const position_sample_t *sample) {
+COLD static void seek(position_t *position, const position_set_point_t *set_point, const position_sample_t *sample) {
     const bool forward =
         set_point->homing == POSITION_HOMING_INDEX_FORWARD || set_point->homing == POSITION_HOMING_STOP_FORWARD;
     const int64_t far = INT64_C(2) << PROFILE_FRACTION_BITS;
@@ -137,8 +138,8 @@ static void seek(position_t *position, const position_set_point_t *set_point, co
     }
 }
 
-static void home(position_t *position, const position_command_t *command, const position_sample_t *sample,
-                 bool begins) {
+COLD NOINLINE static void home(position_t *position, const position_command_t *command, const position_sample_t *sample,
+                               bool begins) {
     const position_set_point_t *set_point = &command->set_point;
     if (begins) {
         begin_homing(position, set_point);
@@ -162,8 +163,8 @@ static void home(position_t *position, const position_command_t *command, const 
 }
 
 /* a0 and q of the cubic from the reference to a position with a speed; false when it exceeds the limits. */
-static bool begin_cubic(const position_parameters_t *parameters, position_t *position, const profile_limits_t *limits,
-                        int64_t to, int64_t speed) {
+COLD static bool begin_cubic(const position_parameters_t *parameters, position_t *position,
+                             const profile_limits_t *limits, int64_t to, int64_t speed) {
     const int64_t ticks = parameters->cycle_ticks;
     profile_state_t *from = &position->profile.start;
     const int64_t way = to - from->x;
@@ -200,8 +201,8 @@ static int64_t speed_of_targets(const position_parameters_t *parameters, const p
     return profile_scale(position->targets < 3 ? 2 * before : 3 * before - earlier, parameters->half_per_ticks);
 }
 
-static void follow_targets(const position_parameters_t *parameters, position_t *position,
-                           const position_command_t *command, bool begins) {
+COLD NOINLINE static void follow_targets(const position_parameters_t *parameters, position_t *position,
+                                         const position_command_t *command, bool begins) {
     const int64_t to = to_profile(limited(command->set_point.target));
     if (begins) {
         position->targets = 0;
@@ -236,8 +237,8 @@ static void follow_targets(const position_parameters_t *parameters, position_t *
 }
 
 /* Beyond the limit at the end of a tick. */
-static void check_following(const position_parameters_t *parameters, position_t *position,
-                            const position_sample_t *sample) {
+COLD NOINLINE static void check_following(const position_parameters_t *parameters, position_t *position,
+                                          const position_sample_t *sample) {
     position_status_t *status = &position->status;
     const int64_t error = position->profile.start.x - to_profile(status->position);
     const bool beyond = error > parameters->following_error || error < -parameters->following_error;
@@ -253,8 +254,8 @@ static void check_following(const position_parameters_t *parameters, position_t 
 }
 
 /* The order decides where the reference goes from this tick on. */
-static void decide(const position_parameters_t *parameters, position_t *position, const position_command_t *command,
-                   const position_sample_t *sample) {
+COLD NOINLINE static void decide(const position_parameters_t *parameters, position_t *position,
+                                 const position_command_t *command, const position_sample_t *sample) {
     const position_set_point_t *set_point = &command->set_point;
     const bool begins = set_point->order != position->order;
     position->status.limited = position->status.limited && !begins;
@@ -281,8 +282,8 @@ static void decide(const position_parameters_t *parameters, position_t *position
     position->status.homing = position->homing != POSITION_HOMING_IDLE;
 }
 
-static void tick(const position_parameters_t *parameters, position_t *position, const position_command_t *command,
-                 const position_sample_t *sample) {
+COLD NOINLINE static void tick(const position_parameters_t *parameters, position_t *position,
+                               const position_command_t *command, const position_sample_t *sample) {
     profile_t *profile = &position->profile;
     if (position->cubic_ticks > 0) {
         const int64_t q = profile->q;

@@ -1,5 +1,6 @@
 #include "control/position/profile.h"
 
+#include "fixed/compiler.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
@@ -25,7 +26,8 @@ static int64_t with_sign(uint64_t value, int64_t sign) {
     return sign < 0 ? -(int64_t)value : (int64_t)value;
 }
 
-int64_t profile_scale(int64_t value, profile_scale_t scale) {
+/* Not inlined, as the next ones, which have many callers: 64-bit products are long. */
+NOINLINE int64_t profile_scale(int64_t value, profile_scale_t scale) {
     const uint64_t of = magnitude(value);
     const uint64_t product = (of >> 32) * scale.factor + ((uint32_t)of * (uint64_t)scale.factor >> 32);
     return with_sign(product >> (scale.shift & 31u), value);
@@ -40,7 +42,7 @@ static uint64_t shifted(int64_t value, int shift) {
     return shift >= 0 ? (uint64_t)value << shift : (uint64_t)value >> -shift;
 }
 
-profile_scale_t profile_scale_of(int64_t numerator, int64_t denominator) {
+COLD NOINLINE profile_scale_t profile_scale_of(int64_t numerator, int64_t denominator) {
     const int up = normalising_shift(numerator), down = normalising_shift(denominator);
     const uint64_t above = shifted(numerator, up), below = shifted(denominator, down);
     const int64_t factor = fixed_divide((int64_t)(above << 31), (int64_t)below); /* 2^30 to 2^32 - 1 */
@@ -48,7 +50,7 @@ profile_scale_t profile_scale_of(int64_t numerator, int64_t denominator) {
     return (profile_scale_t){.factor = (uint32_t)factor, .shift = (uint32_t)shift};
 }
 
-int64_t profile_by_q16(int64_t value, uint32_t time_q16) {
+NOINLINE int64_t profile_by_q16(int64_t value, uint32_t time_q16) {
     const uint64_t of = magnitude(value);
     const uint64_t high = (of >> 32) * time_q16;
     if (high >> 43 != 0) {
@@ -57,7 +59,7 @@ int64_t profile_by_q16(int64_t value, uint32_t time_q16) {
     return with_sign((high << 16) + ((uint32_t)of * (uint64_t)time_q16 >> 16), value);
 }
 
-profile_limits_t profile_limits(int64_t speed, int64_t acceleration, int64_t deceleration, int64_t jerk) {
+COLD NOINLINE profile_limits_t profile_limits(int64_t speed, int64_t acceleration, int64_t deceleration, int64_t jerk) {
     const int64_t least = PROFILE_Q_MIN * 6 * PROFILE_RAMP_TICKS_MIN;
     const int64_t up = fixed_clamp_64(acceleration, least, PROFILE_SPEED_MAX);
     const int64_t down = fixed_clamp_64(deceleration, least, PROFILE_SPEED_MAX);
@@ -82,7 +84,7 @@ profile_limits_t profile_limits(int64_t speed, int64_t acceleration, int64_t dec
     };
 }
 
-static uint32_t time_q16(int64_t value, profile_scale_t per) {
+NOINLINE static uint32_t time_q16(int64_t value, profile_scale_t per) {
     const uint64_t time = magnitude(profile_scale(value, per));
     return time < TIME_MAX_Q16 ? (uint32_t)time : TIME_MAX_Q16;
 }
@@ -127,7 +129,7 @@ static int64_t speed_of_ramp(int64_t a, uint32_t time_q16) {
     return profile_by_q16(a < 0 ? -a : a, time_q16) >> 1;
 }
 
-int64_t profile_stop(const profile_limits_t *limits, const profile_state_t *state) {
+NOINLINE int64_t profile_stop(const profile_limits_t *limits, const profile_state_t *state) {
     const uint32_t time = time_q16(state->a, limits->per_jerk);
     const int64_t ramp = speed_of_ramp(state->a, time);
     const bool forward = state->v + (state->a < 0 ? -ramp : ramp) >= 0;
@@ -139,7 +141,7 @@ int64_t profile_stop(const profile_limits_t *limits, const profile_state_t *stat
     return state->x + ramped + cubic + (forward ? distance : -distance);
 }
 
-profile_state_t profile_advance(const profile_state_t *state, int64_t q) {
+NOINLINE profile_state_t profile_advance(const profile_state_t *state, int64_t q) {
     return (profile_state_t){
         .x = state->x + state->v + (state->a >> 1) + q,
         .v = state->v + state->a + 3 * q,
@@ -147,7 +149,7 @@ profile_state_t profile_advance(const profile_state_t *state, int64_t q) {
     };
 }
 
-void profile_begin_moving(profile_t *profile, int64_t x, int64_t v) {
+NOINLINE void profile_begin_moving(profile_t *profile, int64_t x, int64_t v) {
     *profile = (profile_t){.start = {.x = x, .v = v}, .end = {.x = x, .v = v}};
     profile->end.x += v;
 }
@@ -157,7 +159,7 @@ void profile_begin(profile_t *profile, int64_t x) {
 }
 
 /* Jerk of the deadbeat law, rounded to nearest or away from 0 by an LSB. */
-static int64_t deadbeat_q(const profile_state_t *state, int64_t target) {
+NOINLINE static int64_t deadbeat_q(const profile_state_t *state, int64_t target) {
     const int64_t sum = 6 * (state->x - target) + 12 * state->v + 11 * state->a;
     return -profile_scale(sum, (profile_scale_t){.factor = PER_36_Q36, .shift = 4});
 }
@@ -217,7 +219,7 @@ static bool too_high(const profile_limits_t *limits, const profile_t *profile, i
     return profile_stop(limits, &next) > target;
 }
 
-void profile_search(const profile_limits_t *limits, profile_t *profile, int64_t target) {
+NOINLINE void profile_search(const profile_limits_t *limits, profile_t *profile, int64_t target) {
     const uint32_t step = profile->steps;
     profile->steps++;
     if (step == 0) {
@@ -250,7 +252,7 @@ void profile_tick(profile_t *profile) {
     profile->settled = false;
 }
 
-profile_state_t profile_at(const profile_t *profile, uint32_t part_q16) {
+NOINLINE profile_state_t profile_at(const profile_t *profile, uint32_t part_q16) {
     const profile_state_t *from = &profile->start;
     const int64_t a = from->a + profile_by_q16(6 * profile->q, part_q16);
     const int64_t gained = profile_by_q16((from->a >> 1) + (a >> 1), part_q16);
