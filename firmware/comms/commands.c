@@ -76,8 +76,31 @@ static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) 
 
 static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH, "both commands have one check of their length");
 
+/* As unpack; the order and the position in its range are valid in every bit. */
+static bool unpack_position(const hal_can_frame_t *frame, command_t *command) {
+    struct drive_position_command_t message;
+    drive_position_command_unpack(&message, frame->data, frame->length);
+    if (!drive_position_command_request_is_in_range(message.request) ||
+        !drive_position_command_order_is_in_range(message.order)) {
+        return false;
+    }
+    command->request = (command_request_t)message.request;
+    command->mode = DRIVE_MODE_POSITION;
+    command->speed_reference_q22 = 0; /* of a drive without this mode, and of one that loses its commands */
+    command->position = (position_set_point_t){
+        .order = (position_order_t)message.order,
+        .homing = POSITION_HOMING_METHODS,
+        .sequence = command->position.sequence + 1,
+        .target = units_position(message.position_deg),
+    };
+    return true;
+}
+
 /* Writes the request and the reference of a command with a valid checksum; false: out of range, nothing is written. */
 static bool unpack(const hal_can_frame_t *frame, command_t *command) {
+    if (frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID) {
+        return unpack_position(frame, command);
+    }
     if (frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID) {
         struct drive_torque_command_t message;
         drive_torque_command_unpack(&message, frame->data, frame->length);
@@ -148,7 +171,8 @@ static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_
 static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
-    if (frame->length != DRIVE_COMMAND_LENGTH) {
+    const bool position = frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID;
+    if (frame->length != (position ? DRIVE_POSITION_COMMAND_LENGTH : DRIVE_COMMAND_LENGTH)) {
         return reject_command(commands, &counters->wrong_length);
     }
     commands_frame_t rejection;
@@ -246,6 +270,9 @@ commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_ca
     }
     if (frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID) {
         return receive_command(commands, DRIVE_TORQUE_COMMAND_E2E_DATA_ID, frame, time_us, command);
+    }
+    if (frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID) {
+        return receive_command(commands, DRIVE_POSITION_COMMAND_E2E_DATA_ID, frame, time_us, command);
     }
     if (frame->identifier == DRIVE_ARM_FRAME_ID) {
         return receive_arming(commands, hal, frame, time_us, timeout_us, command);

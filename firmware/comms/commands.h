@@ -6,7 +6,7 @@
  * (reset and watchdog included), a fault, the end of a run, off and clear_fault after a run was requested, a stop
  * outside of a run, COMMAND_LOST_US without a valid command, outside of a run the command timeout, and commands_disarm.
  *
- * Second sender: both command messages have one sequence counter, and while the drive is armed the receiver stays with
+ * Second sender: all command messages have one sequence counter, and while the drive is armed the receiver stays with
  * the sender that it followed when it was armed. A frame of another one is invalid, but for the few whose counter is by
  * chance the next; then the first sender's are. Every invalid command frame (length, checksum, counter, range) adds
  * COMMANDS_ERROR_STEP to a count, every valid one takes 1 from it; COMMANDS_ERRORS_MAX invalid ones in succession,
@@ -56,7 +56,7 @@ typedef struct {
 } commands_counters_t;
 
 typedef struct {
-    e2e_receiver_t receiver;     /* of DRIVE_COMMAND and DRIVE_TORQUE_COMMAND */
+    e2e_receiver_t receiver;     /* of DRIVE_COMMAND, DRIVE_TORQUE_COMMAND, DRIVE_POSITION_COMMAND */
     uint16_t data_id_offset;     /* of the node, added to the data IDs of drive.dbc; set by the caller after
                                     commands_init */
     uint32_t last_received_us;   /* time of the last frame that it accepted */

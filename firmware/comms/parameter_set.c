@@ -17,7 +17,7 @@ static void begin(parameter_set_t *set, const parameters_t *parameters, bool def
 static void stage(parameter_set_t *set, unsigned index, int32_t value) {
     set->sum += (uint32_t)value - (uint32_t)set->values[index];
     set->values[index] = value;
-    set->written |= UINT64_C(1) << index;
+    set->written |= index < 64 ? UINT64_C(1) << index : 0; /* the others are tunable */
 }
 
 void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame) {

@@ -64,6 +64,7 @@ static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t gro
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
         const bool settable = message->rate != DRIVE_TELEMETRY_RATE_FIXED;
         if (message->group == group && (telemetry->in_fault || !message->if_active) &&
+            (telemetry->position_used || group != DRIVE_TELEMETRY_GROUP_POSITION) &&
             machine_tables.phases > message->phases_above &&
             count_down(&telemetry->countdown[i], settable ? telemetry->period[message->rate] : message->period)) {
             due[count++] = message;
@@ -135,6 +136,8 @@ void telemetry_cycle(telemetry_t *telemetry, drive_telemetry_t *values) {
     telemetry->backlog = frame_queue_peek(&telemetry->queue) != NULL;
     follow_fault(telemetry, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_MEASUREMENTS, KEPT_FOR_OTHERS, values);
+    telemetry->position_used |= values->position.position_state != DRIVE_POSITION_STATE_INACTIVE;
+    enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_POSITION, KEPT_FOR_OTHERS, values);
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_FAULT, KEPT_FOR_HEARTBEAT, values);
     values->bus_counters.telemetry_dropped = telemetry->dropped;
     enqueue_group(telemetry, DRIVE_TELEMETRY_GROUP_COUNTERS, KEPT_FOR_HEARTBEAT, values);

@@ -42,6 +42,7 @@ typedef struct {
     uint16_t period[DRIVE_TELEMETRY_RATES];       /* cycles; not of `fixed` */
     uint16_t countdown[DRIVE_TELEMETRY_MESSAGES]; /* cycles until each message is due */
     bool in_fault;
+    bool position_used;         /* position mode has been used since the start: its messages are sent */
     uint32_t fault_time_us;     /* of the fault reported last */
     bool background_queued;     /* a frame of `background` or `idle` is in the queue */
     bool background_in_mailbox; /* one may be in a mailbox; cleared by the caller when none is taken */

@@ -33,3 +33,7 @@ int32_t units_deviation_q20(int32_t angle) {
 int32_t units_torque_q8(int32_t torque_q24) {
     return (int32_t)fixed_shift(torque_q24, 16);
 }
+
+int32_t units_position_q18(int64_t position) {
+    return fixed_saturate(fixed_shift(position, 14));
+}

@@ -8,6 +8,7 @@
  *   torque     Q7.24 N m                      2^-16 N m (command)            units_torque_q24
  *   current    unsigned Q7.9 A                2^-9 A                         none
  *   voltage    unsigned Q9.6 V                2^-6 V                         none
+ *   position   2^-32 turn, 64 bits           2^-18 turn (DBC: degrees)      units_position, units_position_q18
  *   gains      unsigned Q1.15 1/(N m)         2^-15 1/(N m)                  none
  *   duty       Q1.15                          2^-15                          none
  *
@@ -42,5 +43,13 @@ int32_t units_torque_q8(int32_t torque_q24);
 static inline int32_t units_torque_q24(int32_t torque_q16) {
     return torque_q16 * (1 << 8);
 }
+
+/* 2^-32 turn from 2^-18 turn: exact. */
+static inline int64_t units_position(int32_t position_q18) {
+    return (int64_t)position_q18 * (1 << 14);
+}
+
+/* 2^-18 turn from 2^-32 turn, below 2^62; saturates. */
+int32_t units_position_q18(int64_t position);
 
 #endif

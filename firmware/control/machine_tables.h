@@ -92,7 +92,7 @@ typedef struct {
     int16_t off; /* turn-off past it, 2^-16 electrical rev; neighbours in the tables differ by less than a quarter */
 } machine_sharing_window_t;
 
-#define MACHINE_PARAMETERS_MAX 64
+#define MACHINE_PARAMETERS_MAX 96
 
 typedef struct {
     uint8_t phases;            /* 3 to 6 */

@@ -16,7 +16,8 @@
 COLD static void read_stall_input(const control_state_t *control, stall_input_t *input) {
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
     *input = (stall_input_t){
-        .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED,
+        .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED &&
+                      !position_seeks_stop(&control->position),
         .speed_reference_q22 = speed->speed_reference_q22,
         .speed_q22 = control->observer.speed_q22,
         .torque_reference_q24 = control->torque_reference_q24,

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "comms/node.h"
+#include "control/position/position_configure.h"
 #include "drive/background_checks.h"
 #include "drive/telemetry_collect.h"
 #include "fixed/compiler.h"
@@ -185,8 +186,16 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
     /* The request as it was sent: bus-off disarms, and a request to run is published as off. */
     bus->run_inhibited = bus->run_inhibited && drive->comms.commands.requested.request == COMMAND_RUN;
     if (!bus->run_inhibited) {
+        position_command_t position = drive->control.position_command;
+        if (command->mode == DRIVE_MODE_POSITION) {
+            position = position_command(&drive->control_parameters.position, &command->position);
+            if (position.set_point.homing >= POSITION_HOMING_METHODS) {
+                position.set_point.homing = (position_homing_t)drive->parameters.values[PARAMETER_HOMING_METHOD];
+            }
+        }
         hal_critical_enter(hal);
         drive->command = *command;
+        drive->control.position_command = position;
         hal_critical_leave(hal);
         drive->ramping = false;
     }
@@ -231,7 +240,7 @@ static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
     }
     if (!drive->ramping) {
         drive->ramping = true;
-        drive->ramp_of_speed = drive->command.mode == DRIVE_MODE_SPEED;
+        drive->ramp_of_speed = drive->command.mode != DRIVE_MODE_TORQUE;
         drive->ramp_from_q24 = drive->control.torque_reference_q24;
     }
     drive->ramp_us = time_us;

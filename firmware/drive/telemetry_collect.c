@@ -96,6 +96,32 @@ static void collect_estimates(const drive_t *drive, drive_telemetry_t *telemetry
     telemetry->estimates.resistance_ohm = (uint32_t)fixed_non_negative(resistance_q16);
 }
 
+static drive_position_state_t position_state(const position_status_t *status) {
+    if (!status->active) {
+        return DRIVE_POSITION_STATE_INACTIVE;
+    }
+    if (status->following_error) {
+        return DRIVE_POSITION_STATE_FOLLOWING_ERROR;
+    }
+    if (status->homing) {
+        return DRIVE_POSITION_STATE_HOMING;
+    }
+    if (status->in_position) {
+        return DRIVE_POSITION_STATE_IN_POSITION;
+    }
+    return status->reference_ended ? DRIVE_POSITION_STATE_ARRIVED : DRIVE_POSITION_STATE_MOVING;
+}
+
+static void collect_position(const drive_t *drive, drive_telemetry_t *telemetry) {
+    const position_status_t *status = &drive->control.position.status;
+    telemetry->position.position_deg = units_position_q18(status->position);
+    telemetry->position.following_error_deg = units_deviation_q20(status->error);
+    telemetry->position.position_state = (uint32_t)position_state(status);
+    telemetry->position.homed = status->homed;
+    telemetry->position.homing_failed = status->homing_failed;
+    telemetry->position.target_limited = status->limited;
+}
+
 void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us, drive_telemetry_t *telemetry) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -112,7 +138,7 @@ void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us,
     telemetry->status.speed_limited = is_speed_limited(drive);
     telemetry->status.fault = record->fault;
     telemetry->status.voltage_saturated = run && torque_control_voltage_saturated(parameters, control);
-    telemetry->status.mode = control->deferred.mode;
+    telemetry->status.mode = control->position.status.active ? DRIVE_MODE_POSITION : control->deferred.mode;
     telemetry->status.start_inhibited_by = state_machine_first_fault(control->state_machine.start_inhibit_mask);
     telemetry->status.single_pulse = control->deferred.conduction.single_pulse;
     telemetry->status.cycle = drive->comms.telemetry.cycle;
@@ -120,6 +146,8 @@ void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us,
     telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);
     telemetry->motion.speed_reference_rpm = units_milli_rpm(deferred_in_effect(control)->speed.speed_reference_q22);
     telemetry->motion.rotor_angle_deg = units_angle_u16(measured->angle);
+
+    collect_position(drive, telemetry);
 
     telemetry->torque.torque_reference_nm = units_torque_q8(control->torque_reference_q24);
     telemetry->torque.torque_estimate_nm = units_torque_q8(measured->torque_sum_q24);

@@ -11,6 +11,7 @@
 
 #include <stdint.h>
 
+#include "control/position/position.h"
 #include "drive_enumerations.h"
 
 /* Time without a valid command after which a run ends in the fault command_timeout. */
@@ -18,10 +19,11 @@
 
 typedef struct {
     command_request_t request;
-    drive_mode_t mode;            /* of COMMAND_RUN: which of the references it follows */
-    int32_t speed_reference_q22;  /* rad/s, Q9.22, within machine_tables.speed_reference_max, negative: reverse */
-    int32_t torque_reference_q24; /* N m, Q7.24, any value, negative: reverse or braking */
-    uint32_t time_us;             /* the drive's time at acceptance */
+    drive_mode_t mode;             /* of COMMAND_RUN: which of the references it follows */
+    int32_t speed_reference_q22;   /* rad/s, Q9.22, within machine_tables.speed_reference_max, negative: reverse */
+    int32_t torque_reference_q24;  /* N m, Q7.24, any value, negative: reverse or braking */
+    uint32_t time_us;              /* the drive's time at acceptance */
+    position_set_point_t position; /* of the mode position */
 } command_t;
 
 #endif

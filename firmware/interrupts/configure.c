@@ -1,6 +1,7 @@
 #include "interrupts/configure.h"
 
 #include "control/phase_map.h"
+#include "control/position/position_configure.h"
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 #include "interrupts/configure_torque.h"
@@ -238,6 +239,30 @@ static void set_speed_control(control_parameters_t *control, const configure_sou
     control->speed_reference_max_q22 = speed_reference_max_q22(&control->torque_mode, from->tables);
 }
 
+static position_parameters_t position_from(const control_parameters_t *control, const configure_source_t *from) {
+    const int32_t *values = from->values;
+    return position_configure(&(position_settings_t){
+        .control_rate_hz = from->control_rate_hz,
+        .speed_exponent = from->tables->speed_exponent,
+        .angle_step_q32 = control->observer.angle_step_q32,
+        .acceleration_q32 = control->observer.acceleration_q32,
+        .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
+        .speed_max_q22 = control->speed_reference_max_q22,
+        .speed_rpm = values[PARAMETER_POSITION_SPEED_RPM],
+        .acceleration_rpm_s = values[PARAMETER_POSITION_ACCELERATION_RPM_S],
+        .deceleration_rpm_s = values[PARAMETER_POSITION_DECELERATION_RPM_S],
+        .jerk_rpm_s2 = values[PARAMETER_POSITION_JERK_RPM_S2],
+        .gain_1_s = values[PARAMETER_POSITION_GAIN_1_S],
+        .lowest_rev = values[PARAMETER_POSITION_MIN_REV],
+        .highest_rev = values[PARAMETER_POSITION_MAX_REV],
+        .following_error_q7 = values[PARAMETER_FOLLOWING_ERROR_DEG],
+        .window_q15 = values[PARAMETER_POSITION_WINDOW_DEG],
+        .homing_speed_rpm = values[PARAMETER_HOMING_SPEED_RPM],
+        .homing_torque_q24 = values[PARAMETER_HOMING_TORQUE_NM],
+        .cycle_ms = values[PARAMETER_POSITION_CYCLE_MS],
+    });
+}
+
 /* Laws that learn or adapt during a run; after the others, whose parameters they need. */
 static void set_estimators(control_parameters_t *control, const configure_source_t *from) {
     const int32_t *values = from->values;
@@ -316,6 +341,7 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     configure_torque(&control, &from);
     set_estimators(&control, &from);
     set_monitors(&control, &from);
+    control.position = position_from(&control, &from);
     return control;
 }
 
@@ -334,6 +360,7 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
         parameters->predictive.flux = tuned->predictive.flux;
         parameters->conduction = tuned->conduction;
         parameters->misalignment = tuned->misalignment;
+        parameters->position = tuned->position;
         return;
     default: { /* of the observer */
         const unsigned stage = part - CONFIGURE_TUNE_FIRST_STAGE;

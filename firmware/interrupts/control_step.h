@@ -30,6 +30,7 @@
 #include "control/moving_load.h"
 #include "control/observer_bandwidth.h"
 #include "control/periodic_load.h"
+#include "control/position/position_loop.h"
 #include "control/predictive_torque.h"
 #include "control/pwm_ditc.h"
 #include "control/speed_pi.h"
@@ -107,6 +108,7 @@ typedef struct {
     degraded_parameters_t degraded;
     thermal_parameters_t thermal; /* this and the next: by drive.c, which alone needs them */
     temperature_parameters_t temperature;
+    position_parameters_t position;
 } control_parameters_t;
 
 /* Inputs of one control period as the HAL delivers them. */
@@ -161,6 +163,8 @@ typedef struct {
     int32_t approached_q22;           /* speed reference, rad/s, Q9.22 */
     uint32_t updates_since_near;      /* since the speed was first near it */
     bool approaches_reference;        /* until then, and for some more */
+    bool follows_position;            /* position mode, in which the next one takes the place of this */
+    bool accelerates;                 /* the position reference does */
     slow_counts_t slow_counts;
     count_course_t count_course;
     bp_tuner_t tuner;
@@ -196,7 +200,9 @@ typedef struct {
     int32_t flux_misalignment[HAL_PHASES_MAX]; /* by the flux linkage, as reported_fault_mask, 2^-32 electrical rev; 0:
                                                   unknown */
     int32_t torque_limit_q24;          /* of the torque reference's magnitude, as reported_fault_mask, N m, Q7.24 */
-    table_scale_factors_t table_scale; /* written by the background with the interrupts masked */
+    table_scale_factors_t table_scale; /* written by the background with the interrupts masked; so is the next */
+    position_command_t position_command;
+    position_t position; /* written by the deferred interrupt */
 } control_state_t;
 
 /* State INITIALISE, rotor at standstill, controllers reset. */

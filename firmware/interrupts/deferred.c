@@ -3,6 +3,7 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 #include "interrupts/deferred_jobs.h"
+#include "interrupts/position_control.h"
 #include "interrupts/speed_control.h"
 #include "interrupts/torque_control.h"
 
@@ -260,12 +261,14 @@ static void average_torque(deferred_t *deferred, const deferred_input_t *input) 
     deferred->mean_torque_q24 += input->torque_sum_q24 >> 2;
 }
 
-/* A torque that is at its limit in order to change the speed follows no load. The next mean torque begins. */
+/* A torque that is at its limit in order to change the speed follows no load, nor does that of a position reference
+ * which accelerates. The next mean torque begins. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
-    inertia_step(&parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical,
-                 deferred->mean_torque_q24, at_torque_limit(deferred, input->torque_reference_q24),
-                 deferred->approaches_reference);
+    inertia_step(
+        &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, deferred->mean_torque_q24,
+        deferred->follows_position ? deferred->accelerates : at_torque_limit(deferred, input->torque_reference_q24),
+        deferred->follows_position || deferred->approaches_reference);
     deferred->mean_torque_q24 = 0;
 }
 
@@ -407,7 +410,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
     }
     results->generation = input->generation;
     results->fault_mask = (uint32_t)protect(parameters, deferred, input) | state->reported_fault_mask;
-    speed_control_deferred(parameters, deferred, input, command, state->torque_limit_q24, results);
+    position_control_deferred(parameters, state, input, command, results);
     follow_innovation(parameters, deferred, input, results);
     deferred->run = input->run;
     if (!input->run) {

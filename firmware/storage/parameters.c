@@ -17,15 +17,20 @@ static const parameter_row_t rows[PARAMETER_COUNT] = {
 #undef PARAMETER
 };
 
-static const uint64_t tunable = 0
+static const bool tunable[PARAMETER_COUNT] = {
 #define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)
 #define TUNABLE_PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                     \
-    | UINT64_C(1) << PARAMETER_##index
+    [PARAMETER_##index] = true,
 #include "storage/parameters.def"
 #undef PARAMETER
-    ;
+};
 
-static_assert((int)PARAMETER_COUNT <= 64, "a bit each");
+/* The mask of what has been written ends with 64: from there on a parameter needs none. */
+#define PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)                             \
+    static_assert((int)PARAMETER_##index < 64, "the mask of what has been written");
+#define TUNABLE_PARAMETER(index, name, unit, fraction_bits, minimum, maximum, default_value, text)
+#include "storage/parameters.def"
+#undef PARAMETER
 
 /* Name and unit of each parameter in turn; pointers to them would take half as much flash again. */
 static const char texts[] =
@@ -106,7 +111,7 @@ int32_t parameters_default(const parameters_t *parameters, unsigned index) {
 }
 
 bool parameters_tunable(unsigned index) {
-    return (tunable >> index & 1) != 0;
+    return tunable[index];
 }
 
 static bool in_range(const int32_t values[PARAMETER_COUNT], unsigned index) {
@@ -120,7 +125,7 @@ static parameters_verdict_t check_each(const int32_t values[PARAMETER_COUNT], ui
         }
     }
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
-        if (running && (written >> i & 1) != 0 && !parameters_tunable(i)) {
+        if (running && !parameters_tunable(i) && (written >> i & 1) != 0) {
             return (parameters_verdict_t){PARAMETER_STATUS_NOT_WHILE_RUNNING, (uint8_t)i, 0};
         }
     }
@@ -137,6 +142,7 @@ static const struct {
     {PARAMETER_TURN_ON_ANGLE_DEG, PARAMETER_TURN_OFF_ANGLE_DEG, true},
     {PARAMETER_TURN_OFF_ANGLE_DEG, PARAMETER_OUTGOING_OFF_ANGLE_DEG, false},
     {PARAMETER_TORQUE_BAND_INNER_NM, PARAMETER_TORQUE_BAND_OUTER_NM, false},
+    {PARAMETER_POSITION_MIN_REV, PARAMETER_POSITION_MAX_REV, true},
 };
 
 static parameters_verdict_t check_orders(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {

@@ -144,7 +144,7 @@ def frames_of(page: str, name: str) -> list[tuple[int, bytes]]:
 
 
 def test_every_frame_is_what_the_text_says() -> None:
-    assert check(PAGE) == 24
+    assert check(PAGE) == 25
 
 
 def test_every_protected_message_is_worked_out_and_stated_as_in_the_database() -> None:

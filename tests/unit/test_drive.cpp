@@ -1467,7 +1467,7 @@ TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
             configure_control(&drive.parameters, &machine_tables, 40000, 17, 12, 200000000);
         EXPECT_STREQ(difference(expected, drive.control_parameters), "") << parameters_name(index);
     }
-    EXPECT_EQ(tuned, 14u);
+    EXPECT_EQ(tuned, 25u);
     EXPECT_EQ(drive.control.deferred.speed_smc.gain_q24, drive.control_parameters.speed_smc.gain_q24);
     EXPECT_EQ(drive.control.deferred.speed_smc.delta_q27, drive.control_parameters.speed_smc.delta_q27);
 }

@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 extern "C" {
+#include "control/position/position_configure.h"
 #include "interrupts/configure.h"
 #include "interrupts/control_step.h"
 #include "interrupts/deferred.h"
@@ -45,7 +46,7 @@ unsigned tune(parameters_t &p, std::mt19937_64 &random, bool runs) {
     for (unsigned index = 0; index < PARAMETER_COUNT; index++) {
         if (parameters_tunable(index) && random() % 3 == 0) {
             set.values[index] = any_value(index, random);
-            written |= uint64_t(1) << index;
+            written |= index < 64 ? uint64_t(1) << index : 0;
         }
     }
     // The set itself may have contradictions, which remain; no tunable parameter is part of one.
@@ -68,6 +69,22 @@ machine_tables_t four_phases() {
         }
     }
     return tables;
+}
+
+// Most targets are within reach.
+position_set_point_t any_set_point(std::mt19937_64 &random) {
+    position_set_point_t set_point{};
+    set_point.order = position_order_t(random() % 4);
+    set_point.homing = position_homing_t(random() % POSITION_HOMING_METHODS);
+    set_point.sequence = uint32_t(random());
+    set_point.target = int64_t(random()) >> (random() % 34);
+    set_point.speed_q22 = int32_t(random() >> (random() % 64));
+    set_point.acceleration_rpm_s = int32_t(random() >> (random() % 64));
+    set_point.deceleration_rpm_s = int32_t(random() >> (random() % 64));
+    set_point.jerk_rpm_s2 = int32_t(random() >> (random() % 64));
+    set_point.speed_offset_q22 = int32_t(random() >> (random() % 64));
+    set_point.torque_offset_q24 = int32_t(random() >> (random() % 64));
+    return set_point;
 }
 
 // A plausible bench that goes wild now and then.
@@ -104,8 +121,9 @@ struct bench_t {
             command.time_us = sample.time_us;
             command.request = rarely(3) ? command_request_t(random() % 4) : COMMAND_RUN;
             command.speed_reference_q22 = int32_t(uint32_t(random()));
-            command.mode = drive_mode_t(random() % 2);
+            command.mode = drive_mode_t(random() % 3);
             command.torque_reference_q24 = int32_t(uint32_t(random()));
+            command.position = any_set_point(random);
         }
     }
 };
@@ -144,6 +162,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 deferred_tune(&parameters, &state);
                 ASSERT_STREQ(difference(parameters, of_the_set), "") << "sequence " << sequence;
             }
+            state.position_command = position_command(&parameters.position, &bench.command.position);
             const drive_state_t before = state.state_machine.state;
             hal_pwm_compare_t compare;
             const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
@@ -197,10 +216,12 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                 sample.missed_interrupts = uint32_t(random());
                 sample.time_us = uint32_t(random());
                 const command_t command = {.request = command_request_t(random() % 4),
-                                           .mode = drive_mode_t(random() % 2),
+                                           .mode = drive_mode_t(random() % 3),
                                            .speed_reference_q22 = int32_t(uint32_t(random())),
                                            .torque_reference_q24 = int32_t(uint32_t(random())),
-                                           .time_us = uint32_t(random())};
+                                           .time_us = uint32_t(random()),
+                                           .position = any_set_point(random)};
+                state.position_command = position_command(&parameters.position, &command.position);
                 hal_pwm_compare_t compare;
                 const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
                 if (random() % 4 != 0) {

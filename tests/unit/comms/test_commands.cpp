@@ -159,9 +159,9 @@ TEST_F(Commands, every_unknown_standard_identifier_is_rejected) {
         frame.identifier = identifier;
         frame.length = 8;
         if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_TORQUE_COMMAND_FRAME_ID &&
-            identifier != DRIVE_ARM_FRAME_ID && identifier != DRIVE_PARAMETER_WRITE_FRAME_ID &&
-            identifier != DRIVE_PARAMETER_SET_CONTROL_FRAME_ID && identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID &&
-            identifier != DRIVE_XCP_COMMAND_FRAME_ID) {
+            identifier != DRIVE_POSITION_COMMAND_FRAME_ID && identifier != DRIVE_ARM_FRAME_ID &&
+            identifier != DRIVE_PARAMETER_WRITE_FRAME_ID && identifier != DRIVE_PARAMETER_SET_CONTROL_FRAME_ID &&
+            identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID && identifier != DRIVE_XCP_COMMAND_FRAME_ID) {
             expect_rejected(frame, &commands.counters.unknown_frame);
         }
     }

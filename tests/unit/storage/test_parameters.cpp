@@ -123,8 +123,8 @@ TEST_F(StoredParameters, thresholds_that_the_present_supply_would_fail_are_refus
 
 TEST_F(StoredParameters, in_a_run_the_first_written_parameter_that_is_not_tunable_is_named_and_no_other) {
     const parameters_conditions_t running = {true, 0};
-    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
-        const uint64_t later = i + 1 < PARAMETER_COUNT ? UINT64_MAX << (i + 1) : 0;
+    for (unsigned i = 0; i < 64; i++) { // bits of the mask; the later ones are tunable
+        const uint64_t later = i + 1 < 64 ? UINT64_MAX << (i + 1) : 0;
         for (const uint64_t more : {uint64_t(0), later}) {
             const parameters_verdict_t verdict =
                 parameters_check(&parameters, parameters.values, UINT64_C(1) << i | more, &running);

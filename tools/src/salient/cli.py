@@ -148,15 +148,16 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
             ("speed", "RPM", "arm the drive and run it at a speed, then stop it: after --duration-s or by Ctrl-C (a "
              "second one opens the switches at once)"),
             ("torque", "NM", "likewise with a torque"),
+            ("position", "DEG", "likewise with a move to an absolute position"),
             ("load", "NM", "set the load torque of the test bench"),
             ("stop", None, "ramp the drive to zero, taking over from the command that runs it"),
             ("clear", None, "clear a fault"),
-            ("arm", None, "arm the drive and let it be, to see that it can be armed; speed and torque do it by "
-             "themselves")):
+            ("arm", None, "arm the drive and let it be, to see that it can be armed; speed, torque and position do it "
+             "by themselves")):
         action = actions.add_parser(name, help=text, description=text, prog=f"{COMMAND} command {name}")
         if metavar is not None:
             action.add_argument("value", type=_finite, metavar=metavar)
-        if name in ("speed", "torque"):
+        if name in ("speed", "torque", "position"):
             action.add_argument("--duration-s", type=_positive, metavar="X",
                                 help="virtual time after which it stops the drive (default: when interrupted)")
         _add_can(action)

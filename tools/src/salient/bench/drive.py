@@ -25,6 +25,8 @@ from salient.machine.parameter_table import CHOICES, value_name
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
+_POSITION_COMMAND = drive_database().get_message_by_name("DRIVE_POSITION_COMMAND")
+ORDERS = value_numbers(drive_database(), "DRIVE_POSITION_COMMAND", "order")
 REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
 assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
@@ -78,13 +80,19 @@ def torque_command_frame(counter: int, request: str, torque_reference_Nm: float,
     return _protected(message, counter, request, {"torque_reference_Nm": torque_reference_Nm})
 
 
+def position_command_frame(counter: int, request: str, order: str, position_deg: float,
+                           message: Message = _POSITION_COMMAND) -> can.Message:
+    """A DRIVE_POSITION_COMMAND with its checksum, as command_frame; order one of ORDERS."""
+    return _protected(message, counter, request, {"order": ORDERS[order], "position_deg": position_deg})
+
+
 def _protected(command: Message, counter: int, request: str, reference: Mapping[str, float]) -> can.Message:
     return e2e.protected_frame(command, counter, {"request": REQUESTS[request], **reference})
 
 
 class Drive(KnownAttributes):
-    """Commands a drive. Assigning speed_reference_rpm or torque_reference_Nm requests run in speed or torque mode; the
-    command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
+    """Commands a drive. Assigning speed_reference_rpm, torque_reference_Nm or position_deg requests run in speed, torque
+    or position mode; the command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
     Nothing is sent before the first request. A request to run arms a drive that is not armed, while time advances: the
     drive runs about a millisecond later. One that was disarmed by a fault stays so until the next request.
     OtherDatabase instead of a request to run when the drive's DBC is another
@@ -105,7 +113,10 @@ class Drive(KnownAttributes):
         self._request: str | None = None
         self._speed_reference_rpm = 0.0
         self._torque_reference_Nm = 0.0
-        self._torque_mode = False
+        self._position_command = session.drive_database.get_message_by_name(_POSITION_COMMAND.name)
+        self._position_deg = 0.0
+        self._order = "profile"
+        self._mode = "speed"
         self._counter = 0
         self._arming: ArmingSequence | None = None
         self._arming_counter = 0
@@ -135,7 +146,7 @@ class Drive(KnownAttributes):
             raise DriveError(f"speed_reference_rpm {value:g}: the drive's encoder allows 0, or from "
                              f"{self.lowest_speed_rpm:.2f} r/min on")
         self._speed_reference_rpm = checked
-        self._torque_mode = False
+        self._mode = "speed"
         self.ask("run")
 
     @property
@@ -147,7 +158,37 @@ class Drive(KnownAttributes):
     @torque_reference_Nm.setter
     def torque_reference_Nm(self, value: float) -> None:
         self._torque_reference_Nm = _checked(self._torque_command, "torque_reference_Nm", value)
-        self._torque_mode = True
+        self._mode = "torque"
+        self.ask("run")
+
+    @property
+    def position_deg(self) -> float:
+        """Last requested position over any number of turns; assigning it moves there by the profile of the parameters
+        position_*. Requests from here on are in position mode; the position itself is DRIVE_POSITION.position_deg.
+        DriveError beyond +-8192 turns."""
+        return self._position_deg
+
+    @position_deg.setter
+    def position_deg(self, value: float) -> None:
+        self._order_position("profile", value)
+
+    def follow_position(self, position_deg: float) -> None:
+        """The next one of cyclic positions, which come every position_cycle_ms."""
+        self._order_position("cyclic", position_deg)
+
+    def home(self, position_deg: float = 0.0) -> None:
+        """Homes by the parameter homing_method; the place that it finds is called position_deg. Another order or mode
+        ends it."""
+        self._order_position("home", position_deg)
+
+    def halt(self) -> None:
+        """Stops by the profile and holds; acknowledges a following error."""
+        self._order_position("halt", self._position_deg)
+
+    def _order_position(self, order: str, position_deg: float) -> None:
+        self._position_deg = _checked(self._position_command, "position_deg", position_deg)
+        self._order = order
+        self._mode = "position"
         self.ask("run")
 
     def stop(self) -> None:
@@ -241,13 +282,18 @@ class Drive(KnownAttributes):
         if self._request == "run":
             self._require_drive_database()
         counter = self._counter
-        if self._torque_mode:
+        period_ns = COMMAND_PERIOD_NS
+        if self._mode == "position":
+            self._session.send(position_command_frame(counter, self._request, self._order, self._position_deg,
+                                                      self._position_command))
+            period_ns += COMMAND_PERIOD_NS // 2 if self._order == "cyclic" else 0  # not beside the next one
+        elif self._mode == "torque":
             self._session.send(torque_command_frame(counter, self._request, self._torque_reference_Nm,
                                                     self._torque_command))
         else:
             self._session.send(command_frame(counter, self._request, self._speed_reference_rpm, self._command))
         self._counter = (counter + 1) % 256
-        self.command_due_ns = self._session.time_ns + COMMAND_PERIOD_NS
+        self.command_due_ns = self._session.time_ns + period_ns
 
     @property
     def state(self) -> str:
@@ -261,7 +307,7 @@ class Drive(KnownAttributes):
 
     @property
     def mode(self) -> str:
-        """speed or torque, by its latest telemetry."""
+        """speed, torque or position, by its latest telemetry."""
         return self._session.telemetry["DRIVE_STATUS.mode"].last_name
 
     @property

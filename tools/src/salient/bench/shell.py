@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
+from cantools.database.can.signal import Signal
 
 from salient.bench.arming import ArmingSequence, response_to
 from salient.bench.drive import COMMAND_PERIOD_NS
@@ -34,8 +35,9 @@ _OWN_FRAMES = 64
 """Sent in the longest time that the bus takes for a frame; fewer than the values of the counter."""
 _FOREIGN_MAX = 3
 """Commands of another sender, sent before it has seen that its place is taken."""
-_REFERENCES = {"speed": ("DRIVE_COMMAND", "speed_reference_rpm"), "torque": ("DRIVE_TORQUE_COMMAND",
-                                                                             "torque_reference_Nm")}
+_REFERENCES = {"speed": ("DRIVE_COMMAND", "speed_reference_rpm"),
+               "torque": ("DRIVE_TORQUE_COMMAND", "torque_reference_Nm"),
+               "position": ("DRIVE_POSITION_COMMAND", "position_deg")}
 
 
 class _Shell(Session):
@@ -95,17 +97,22 @@ class _Shell(Session):
 def run(options: argparse.Namespace) -> int:
     """The action of a command line; its exit code."""
     actions: dict[str, Callable[[_Shell, Any], int]] = {
-        "speed": _run_drive, "torque": _run_drive, "load": _load, "stop": _stop, "clear": _clear, "arm": _arm}
+        "speed": _run_drive, "torque": _run_drive, "position": _run_drive,
+        "load": _load, "stop": _stop, "clear": _clear, "arm": _arm}
     with _Shell(options) as shell:
         _check_range(shell, options)
         return actions[options.action](shell, options)
 
 
+def _reference(shell: _Shell, action: str) -> Signal:
+    message, name = _REFERENCES[action]
+    return shell.drive_database.get_message_by_name(message).get_signal_by_name(name)
+
+
 def _check_range(shell: _Shell, options: argparse.Namespace) -> None:
     """UsageError for a reference beyond the range of the machine that the drive carries."""
     if options.action in _REFERENCES:
-        message, name = _REFERENCES[options.action]
-        reference = shell.drive_database.get_message_by_name(message).get_signal_by_name(name)
+        reference = _reference(shell, options.action)
         low, high = signal_range(reference)
         if not low <= options.value <= high:
             raise UsageError(f"{options.action} {options.value:g}: must be {low:g} to {high:g} {reference.unit}")
@@ -146,7 +153,7 @@ def _run_drive(shell: _Shell, options: argparse.Namespace) -> int:
             if shell.time_ns - started_ns > _START_S * 1e9:
                 raise RunFailed(f"the drive does not arm: it has refused "
                                 f"{shell.telemetry['DRIVE_ARMING.refused'].last:.0f} frames")
-        unit = "r/min" if options.action == "speed" else "N m"
+        unit = _reference(shell, options.action).unit
         until = "until Ctrl-C" if options.duration_s is None else f"for {options.duration_s:g} s"
         _say(f"running: {options.action} {options.value:g} {unit}, {until}")
         end_ns = None if options.duration_s is None else started_ns + round(options.duration_s * 1e9)

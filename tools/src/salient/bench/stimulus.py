@@ -34,7 +34,8 @@ _ONLY_TIME = ("RIG_RUN_UNTIL", "RIG_STAMP")
 """Messages of a host that are no act."""
 _ANSWERS = ("DRIVE_ARMING", "PARAMETER_RESPONSE", "RIG_SET_REPLY", "RIG_FAULT_REPLY")
 _REFERENCES = {"DRIVE_COMMAND": ("speed", "speed_reference_rpm"),
-               "DRIVE_TORQUE_COMMAND": ("torque", "torque_reference_Nm")}
+               "DRIVE_TORQUE_COMMAND": ("torque", "torque_reference_Nm"),
+               "DRIVE_POSITION_COMMAND": ("position", "position_deg")}
 _WRITING = ("write", "save", "restore_defaults")
 """Operations of PARAMETER_REQUEST that do not only read."""
 _XCP_SET_MTA, _XCP_DOWNLOAD, _XCP_DOWNLOAD_BYTES = 0xF6, 0xF0, 6
@@ -148,6 +149,7 @@ class _Reader:
         self._profile: Stimulus | None = None
         self._unanswered: dict[tuple[str, int], deque[tuple[int, Stimulus]]] = defaultdict(deque)
         self._take = {"DRIVE_COMMAND": self._command_frame, "DRIVE_TORQUE_COMMAND": self._command_frame,
+                      "DRIVE_POSITION_COMMAND": self._command_frame,
                       "DRIVE_ARM": self._arm, "PARAMETER_WRITE": self._write, "PARAMETER_SET_CONTROL": self._control,
                       "PARAMETER_REQUEST": self._parameter_request, "DRIVE_ARMING": self._arming_report,
                       "PARAMETER_RESPONSE": self._parameter_response, "RIG_SET": self._rig_set,

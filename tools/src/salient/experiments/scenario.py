@@ -23,6 +23,10 @@
     at_s = 0.2
     value_Nm = 5.0
 
+    [[position]]                            # in position mode, a move to an absolute position
+    at_s = 0.3
+    value_deg = 90.0
+
     [[load]]
     at_s = 0.13
     torque_Nm = 8.0
@@ -45,6 +49,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -91,6 +96,14 @@ class TorqueStep:
 
 
 @dataclass(frozen=True)
+class PositionStep:
+    """Target of a move from at_s on, in position mode."""
+
+    at_s: float
+    value_deg: float
+
+
+@dataclass(frozen=True)
 class LoadStep:
     """Load torque on the shaft from at_s on, positive against forward motion; profile_Nm: the rig's load_profile_Nm,
     None leaves it."""
@@ -129,6 +142,7 @@ class Scenario(Conditions):
     bench: dict[str, float] = field(default_factory=dict)
     speed: tuple[SpeedStep, ...] = ()
     torque: tuple[TorqueStep, ...] = ()
+    position: tuple[PositionStep, ...] = ()
     load: tuple[LoadStep, ...] = ()
     load_profile: str | None = None
     fault: tuple[FaultStep, ...] = ()
@@ -197,13 +211,15 @@ def run_scenario(scenario: Scenario, out_dir: Path, can: str = "local", build: s
             if scenario.parameters:  # one set; the run begins at the same time whatever the lengths of its frames
                 bench.drive.parameters.update(scenario.parameters)
                 bench.advance_to(-(-bench.time_ns // _SETTING_NS) * _SETTING_NS)
-            steps: list[SpeedStep | TorqueStep] = [*scenario.speed, *scenario.torque]
+            steps: list[SpeedStep | TorqueStep | PositionStep] = [*scenario.speed, *scenario.torque, *scenario.position]
             for step in sorted(steps, key=lambda step: step.at_s):
                 _advance(bench, step.at_s)
                 if isinstance(step, SpeedStep):
                     bench.drive.speed_reference_rpm = step.value_rpm
-                else:
+                elif isinstance(step, TorqueStep):
                     bench.drive.torque_reference_Nm = step.value_Nm
+                else:
+                    bench.drive.position_deg = step.value_deg
             _advance(bench, scenario.duration_s)
             fault = bench.drive.fault
         write_logs(bench.log, out_dir / _LOG, out_dir / _TEXT_LOG)
@@ -273,6 +289,8 @@ def summary(result: RunResult) -> dict[str, Any]:
         "frames": result.telemetry.count("DRIVE_STATUS"),
         "fault": result.fault,
     }
+    if result.scenario.position:
+        metrics["position"] = _position_summary(result)
     worst_us = result.telemetry["DRIVE_PROCESSOR.worst_us"].last
     if worst_us > 0:
         metrics["processor"] = {
@@ -284,6 +302,16 @@ def summary(result: RunResult) -> dict[str, Any]:
         window_s = (float(result.recording["time_s"][0]), float(result.recording["time_s"][-1]))
         metrics["losses"] = losses(result.recording, load_machine(machine_path(result.scenario.plant)), window_s)
     return metrics
+
+
+def _position_summary(result: RunResult) -> dict[str, Any]:
+    """Of the telemetry: the last position, the largest following error, and the state at the end."""
+    errors_deg = np.abs(np.asarray(result.telemetry["DRIVE_POSITION.following_error_deg"].value, dtype=float))
+    return {
+        "final_deg": result.telemetry["DRIVE_POSITION.position_deg"].last,
+        "following_error_max_deg": float(errors_deg.max()) if len(errors_deg) else math.nan,
+        "state": result.telemetry["DRIVE_POSITION.position_state"].last_name,
+    }
 
 
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build: str = "host",
@@ -362,6 +390,11 @@ class _TorqueTable(Table):
     value_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
 
 
+class _PositionTable(Table):
+    at_s: _Time
+    value_deg: Annotated[float, number(-2_949_120.0, 2_949_119.0)]
+
+
 class _LoadTable(Table):
     at_s: _Time
     torque_Nm: Annotated[float, number(-10_000.0, 10_000.0)]
@@ -421,6 +454,7 @@ def _scenario_file() -> type[Table]:
         "bench": (bench, bench()),
         "speed": (list[_SpeedTable], []),
         "torque": (list[_TorqueTable], []),
+        "position": (list[_PositionTable], []),
         "load": (list[_LoadTable], []),
         "load_profile": (str, None),
         "fault": (list[_fault_table()], []),  # type: ignore[misc]
@@ -469,6 +503,7 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "bench": {name: getattr(file.bench, name) for name in data.get("bench", {})},  # set in the order of the file
         "speed": tuple(SpeedStep(**step.model_dump()) for step in file.speed),
         "torque": tuple(TorqueStep(**step.model_dump()) for step in file.torque),
+        "position": tuple(PositionStep(**step.model_dump()) for step in file.position),
         "load": tuple(LoadStep(**step.model_dump()) for step in file.load),
         "load_profile": profile,
         "fault": _fault_steps(path, file.fault),

@@ -155,7 +155,7 @@ def _padded(values: list[int]) -> list[int]:
     return values + [0] * (_PARAMETERS_MAX - len(values))
 
 
-_PARAMETERS_MAX = 64
+_PARAMETERS_MAX = 96
 _CELLS = (2 * ROWS * len(CURRENT_A),)
 _RATIO_MAX = 64.0
 

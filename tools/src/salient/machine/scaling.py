@@ -76,6 +76,7 @@ class Exponents:
             "kg m^2": self.torque - self.speed,
             "r/min": self.speed,
             "r/min/s": self.speed,
+            "r/min/s^2": self.speed,
             "s/rad": -self.speed,
             "N m/rad": self.torque - self.speed,
         }.get(unit, 0)

@@ -1,0 +1,106 @@
+#include "control/position/position_configure.h"
+
+#include "fixed/compiler.h"
+#include "fixed/divide.h"
+#include "fixed/fixed.h"
+
+/* 2^48 rev / 60 s in ms, ms^2, ms^3: r/min, r/min/s, r/min/s^2 to those of a profile. */
+#define PER_RPM_Q8 INT64_C(1200959900633)
+#define PER_RPM_S INT64_C(4691250)
+#define PER_RPM_S2 INT64_C(4691)
+
+#define REV (INT64_C(1) << PROFILE_FRACTION_BITS)
+
+COLD NOINLINE static int64_t saturated(int64_t value, int64_t factor) {
+    int64_t product;
+    return __builtin_mul_overflow(value, factor, &product) ? PROFILE_SPEED_MAX : product;
+}
+
+/* r/min in the unit of the machine; 0 for a negative one. */
+COLD NOINLINE static int64_t in_unit(int32_t value, unsigned speed_exponent, int64_t factor) {
+    return saturated((int64_t)fixed_max(value, 0) << speed_exponent, factor);
+}
+
+static int64_t either(int64_t value, int64_t otherwise) {
+    return value > 0 ? value : otherwise;
+}
+
+static int64_t smaller(int64_t a, int64_t b) {
+    return a < b ? a : b;
+}
+
+/* LSB of Q9.22 in 2^-48 rev per tick, Q16: angle_step_q32 is 2^-64 rev per period. */
+static int64_t per_speed_q16(const position_settings_t *settings) {
+    return (int64_t)settings->angle_step_q32 * (settings->control_rate_hz / PROFILE_TICK_HZ);
+}
+
+COLD static profile_limits_t limits_from(const position_settings_t *settings) {
+    const unsigned exponent = settings->speed_exponent;
+    const int64_t per_q16 = per_speed_q16(settings);
+    const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
+    const int64_t speed_max = saturated(settings->speed_max_q22 >> 4, per_q16) >> 12;
+    /* Change of the speed in a period, Q22. */
+    const int64_t change_q22 = fixed_product(settings->torque_max_q24, settings->acceleration_q32) >> 32;
+    const int64_t by_torque = saturated(change_q22 * rate_per_tick, per_q16 >> 8) >> 8;
+    const int64_t speed = in_unit(settings->speed_rpm, exponent, PER_RPM_Q8) >> 8;
+    const int64_t up = either(in_unit(settings->acceleration_rpm_s, exponent, PER_RPM_S), by_torque / 4 * 3);
+    const int64_t down = either(in_unit(settings->deceleration_rpm_s, exponent, PER_RPM_S), up);
+    const int64_t jerk = either(in_unit(settings->jerk_rpm_s2, exponent, PER_RPM_S2), fixed_divide(up, 5));
+    return profile_limits(smaller(either(speed, speed_max), speed_max), up, down, jerk);
+}
+
+COLD static void set_scales(const position_settings_t *settings, position_parameters_t *position) {
+    const int64_t per_q16 = per_speed_q16(settings);
+    const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
+    /* To speed: 2^16 / per_q16. To torque: the speed that an acceleration adds in a period, by that of an LSB. */
+    position->speed_of = profile_scale_of(INT64_C(1) << 16, per_q16);
+    position->gain = profile_scale_of((int64_t)fixed_max(settings->gain_1_s, 1) << 16, per_q16 * PROFILE_TICK_HZ);
+    position->torque_of =
+        profile_scale_of(INT64_C(1) << 32, (per_q16 >> 8) * ((int64_t)settings->acceleration_q32 * rate_per_tick >> 8));
+}
+
+COLD position_parameters_t position_configure(const position_settings_t *settings) {
+    const int64_t ticks = fixed_clamp(settings->cycle_ms, 1, POSITION_CYCLE_TICKS_MAX);
+    const int64_t edge = POSITION_MAX << (PROFILE_FRACTION_BITS - 32);
+    const uint32_t periods = settings->control_rate_hz / PROFILE_TICK_HZ;
+    position_parameters_t position = {
+        .periods_per_tick = periods,
+        .speed_exponent = settings->speed_exponent,
+        .per_speed_q16 = per_speed_q16(settings),
+        .part_per_period_q32 = UINT32_MAX / periods,
+        .lowest = fixed_clamp_64(settings->lowest_rev * REV, -edge, edge),
+        .highest = fixed_clamp_64(settings->highest_rev * REV, -edge, edge),
+        .window = fixed_divide(settings->window_q15 * (REV >> 15), 360),
+        .following_error = fixed_divide(settings->following_error_q7 * (REV >> 7), 360),
+        .homing_speed = in_unit(settings->homing_speed_rpm, settings->speed_exponent, PER_RPM_Q8) >> 8,
+        .homing_torque_q24 =
+            settings->homing_torque_q24 > 0 ? settings->homing_torque_q24 : settings->torque_max_q24 / 4,
+        .cycle_ticks = (uint32_t)ticks,
+        .half_per_ticks = profile_scale_of(1, 2 * ticks),
+        .half_per_ticks2 = profile_scale_of(1, 2 * ticks * ticks),
+        .half_per_ticks3 = profile_scale_of(1, 2 * ticks * ticks * ticks),
+        .limits = limits_from(settings),
+    };
+    position.highest = position.highest > position.lowest ? position.highest : position.lowest;
+    set_scales(settings, &position);
+    return position;
+}
+
+COLD position_command_t position_command(const position_parameters_t *parameters,
+                                         const position_set_point_t *set_point) {
+    position_command_t command = {.set_point = *set_point, .limits = parameters->limits};
+    if (set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 || set_point->deceleration_rpm_s > 0 ||
+        set_point->jerk_rpm_s2 > 0) {
+        const profile_limits_t *most = &parameters->limits;
+        const unsigned exponent = parameters->speed_exponent;
+        const int64_t speed = saturated(fixed_max(set_point->speed_q22, 0) >> 4, parameters->per_speed_q16) >> 12;
+        const int64_t up = in_unit(set_point->acceleration_rpm_s, exponent, PER_RPM_S);
+        const int64_t down = in_unit(set_point->deceleration_rpm_s, exponent, PER_RPM_S);
+        const int64_t jerk = in_unit(set_point->jerk_rpm_s2, exponent, PER_RPM_S2);
+        command.limits = profile_limits(smaller(either(speed, most->speed), most->speed),
+                                        smaller(either(up, most->acceleration), most->acceleration),
+                                        smaller(either(down, most->deceleration), most->deceleration),
+                                        smaller(either(jerk, 6 * most->q), 6 * most->q));
+    }
+    return command;
+}

@@ -1,0 +1,61 @@
+#include "interrupts/position_control.h"
+
+#include "fixed/compiler.h"
+#include "fixed/fixed.h"
+#include "interrupts/speed_control.h"
+
+/* Part of the largest torque that an acceleration asks for from which on it shows the inertia. */
+#define ACCELERATION_SHARE 32
+
+static int32_t torque_limit_q24(const control_parameters_t *parameters, const control_state_t *state) {
+    const int32_t limit_q24 = state->torque_limit_q24;
+    return position_seeks_stop(&state->position) ? fixed_min(limit_q24, parameters->position.homing_torque_q24)
+                                                 : limit_q24;
+}
+
+/* For the identified inertia, J 2^-k. */
+static int32_t for_inertia_q24(const deferred_t *deferred, int32_t torque_q24) {
+    const int32_t k = deferred->inertia.laws.observer.load_shift - 2;
+    return k < 0 ? fixed_saturate((int64_t)torque_q24 * (1 << fixed_min(-k, 8))) : torque_q24 >> fixed_min(k, 31);
+}
+
+NOINLINE static void control_position(const control_parameters_t *parameters, control_state_t *state,
+                                      const deferred_input_t *input, const position_sample_t *sample,
+                                      deferred_results_t *results) {
+    deferred_t *deferred = &state->deferred;
+    const position_output_t output =
+        position_step(&parameters->position, &state->position, &state->position_command, sample);
+    const int32_t limit_q24 = torque_limit_q24(parameters, state);
+    const command_t command = {
+        .request = COMMAND_RUN, .mode = DRIVE_MODE_SPEED, .speed_reference_q22 = output.speed_q22};
+    deferred->speed_reference_q22 = speed_control_limited_q22(parameters, output.speed_q22); /* no ramp */
+    deferred->run = true;
+    deferred->follows_position = true;
+    deferred->accelerates = fixed_abs(output.torque_q24) >= parameters->conduction.torque_max_q24 / ACCELERATION_SHARE;
+    speed_control_deferred(parameters, deferred, input, &command, limit_q24, results);
+    results->speed.speed_law_torque_q24 =
+        fixed_add(results->speed.speed_law_torque_q24, for_inertia_q24(deferred, output.torque_q24));
+}
+
+void position_control_deferred(const control_parameters_t *parameters, control_state_t *state,
+                               const deferred_input_t *input, const command_t *command, deferred_results_t *results) {
+    const int32_t limit_q24 =
+        fixed_min(fixed_min(torque_limit_q24(parameters, state), state->deferred.conduction.torque_max_q24),
+                  -state->deferred.conduction.torque_min_q24);
+    const position_sample_t sample = {
+        .encoder_angle = input->encoder_angle,
+        .angle = input->angle,
+        .speed = (input->speed_q22 >> 4) * (parameters->position.per_speed_q16 >> 4) >> 8,
+        .at_torque_limit = fixed_abs(input->torque_reference_q24) >= limit_q24 - limit_q24 / 16,
+        .count = state->deferred.slow_counts.slow ? 2 * parameters->encoder_middle : 0,
+        .periods = input->periods,
+    };
+    if (input->run && command->mode == DRIVE_MODE_POSITION && command->request == COMMAND_RUN &&
+        parameters->speed_reference_min_q22 < 0) {
+        control_position(parameters, state, input, &sample, results);
+        return;
+    }
+    state->deferred.follows_position = false;
+    position_follow(&state->position, &sample);
+    speed_control_deferred(parameters, &state->deferred, input, command, state->torque_limit_q24, results);
+}

@@ -1,0 +1,359 @@
+// Position loop with an ideal speed loop: orders, counts over turns, end stops, following error, homing, hostile set
+// points.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <random>
+
+#include <gtest/gtest.h>
+
+extern "C" {
+#include "control/position/position_configure.h"
+#include "control/position/position_loop.h"
+}
+
+namespace {
+
+constexpr uint32_t RATE_HZ = 20000;
+constexpr int PERIODS = RATE_HZ / 1000;
+constexpr double REV_48 = 281474976710656.0;
+constexpr double REV_32 = 4294967296.0;
+constexpr double PI = 3.14159265358979323846;
+
+position_settings_t settings() {
+    position_settings_t settings = {};
+    settings.control_rate_hz = RATE_HZ;
+    settings.angle_step_q32 = int32_t(std::ldexp(1.0 / (2.0 * PI) / RATE_HZ, 42));
+    settings.acceleration_q32 = int32_t(std::ldexp(1.0 / RATE_HZ / 0.02, 30));
+    settings.torque_max_q24 = 19 << 24;
+    settings.speed_max_q22 = 300 << 22;
+    settings.acceleration_rpm_s = 6000;
+    settings.jerk_rpm_s2 = 600000;
+    settings.gain_1_s = 150;
+    settings.lowest_rev = -100;
+    settings.highest_rev = 100;
+    settings.following_error_q7 = 45 << 7;
+    settings.window_q15 = 1 << 14;
+    settings.homing_speed_rpm = 120;
+    settings.cycle_ms = 4;
+    return settings;
+}
+
+// The rotor follows the reference speed, unless it is held.
+class PositionLoop : public testing::Test {
+  protected:
+    position_parameters_t parameters = [] {
+        const position_settings_t of = settings();
+        return position_configure(&of);
+    }();
+    position_t position = {};
+    position_command_t command = {};
+    double rotor_rev = 0.25, speed_rev_s = 0.0;  // rotor since the start
+    double lowest_rev = -1e9, highest_rev = 1e9; // mechanical stops
+    position_output_t out = {};
+
+    void order(position_order_t kind, double target_rev, position_homing_t homing = POSITION_HOMING_HERE) {
+        position_set_point_t set_point = {};
+        set_point.order = kind;
+        set_point.homing = homing;
+        set_point.sequence = command.set_point.sequence + 1;
+        set_point.target = int64_t(std::llround(target_rev * REV_32));
+        command = position_command(&parameters, &set_point);
+    }
+
+    position_sample_t sample() const {
+        const auto angle = uint32_t(int64_t(std::llround(rotor_rev * REV_32)));
+        const bool at_stop = rotor_rev <= lowest_rev || rotor_rev >= highest_rev;
+        return {.encoder_angle = angle & ~0x7FFFu, // 17 bits
+                .angle = angle,
+                .speed = int64_t(speed_rev_s * REV_48 * 1e-3),
+                .at_torque_limit = at_stop,
+                .periods = 1};
+    }
+
+    void step() {
+        const position_sample_t now = sample();
+        out = position_step(&parameters, &position, &command, &now);
+        const double rad_s = out.speed_q22 / 4194304.0;
+        const double next = std::clamp(rotor_rev + rad_s / (2.0 * PI) / RATE_HZ, lowest_rev, highest_rev);
+        speed_rev_s = (next - rotor_rev) * RATE_HZ;
+        rotor_rev = next;
+    }
+
+    void ticks(int count) {
+        for (int i = 0; i < count * PERIODS; i++) {
+            step();
+        }
+    }
+
+    double position_rev() const { return double(position.status.position) / REV_32; }
+};
+
+TEST_F(PositionLoop, units_are_those_of_the_speed_loop_and_the_inertia) {
+    const int64_t speed = int64_t(10.0 * REV_48 * 1e-3); // 10 rev/s
+    EXPECT_NEAR(double(profile_scale(speed, parameters.speed_of)) / 4194304.0, 20.0 * PI, 1e-4);
+    EXPECT_NEAR(double(profile_scale(int64_t(REV_48 / 100.0), parameters.gain)) / 4194304.0, 150.0 * 2.0 * PI / 100.0,
+                1e-4);
+    const int64_t acceleration = int64_t(100.0 * REV_48 * 1e-6); // 100 rev/s^2 on 0.02 kg m^2
+    EXPECT_NEAR(double(profile_scale(acceleration, parameters.torque_of)) / 16777216.0, 200.0 * PI * 0.02, 1e-4);
+    EXPECT_NEAR(double(parameters.limits.speed), 300.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
+    EXPECT_NEAR(double(parameters.limits.acceleration), 100.0 * REV_48 * 1e-6, REV_48 * 1e-9);
+}
+
+TEST_F(PositionLoop, limits_of_zero_are_found_from_torque_inertia_and_speed) {
+    position_settings_t of = settings();
+    of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
+    const position_parameters_t automatic = position_configure(&of);
+    const double expected = 0.75 * 19.0 / 0.02 / (2.0 * PI) * REV_48 * 1e-6;
+    EXPECT_NEAR(double(automatic.limits.acceleration), expected, expected * 1e-3);
+    EXPECT_NEAR(6.0 * double(automatic.limits.q), expected / 5.0, expected * 1e-3);
+}
+
+TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
+    position_set_point_t set_point = {};
+    set_point.speed_q22 = INT32_MAX;
+    set_point.acceleration_rpm_s = set_point.deceleration_rpm_s = set_point.jerk_rpm_s2 = INT32_MAX;
+    const position_command_t most = position_command(&parameters, &set_point);
+    EXPECT_EQ(most.limits.speed, parameters.limits.speed);
+    EXPECT_EQ(most.limits.acceleration, parameters.limits.acceleration);
+    EXPECT_LE(most.limits.q, parameters.limits.q);
+    set_point.speed_q22 = 10 << 22;
+    set_point.acceleration_rpm_s = 600;
+    set_point.deceleration_rpm_s = INT32_MIN;
+    set_point.jerk_rpm_s2 = -1;
+    const position_command_t less = position_command(&parameters, &set_point);
+    EXPECT_NEAR(double(less.limits.speed), 10.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
+    EXPECT_NEAR(double(less.limits.acceleration), 10.0 * REV_48 * 1e-6, REV_48 * 1e-9);
+    EXPECT_EQ(less.limits.deceleration, parameters.limits.deceleration);
+}
+
+TEST_F(PositionLoop, begins_where_the_rotor_is_and_moves_to_the_target_over_turns) {
+    order(POSITION_ORDER_PROFILE, -12.375);
+    step();
+    EXPECT_NEAR(position_rev(), 0.25, 1e-5);
+    EXPECT_NEAR(double(position.status.reference) / REV_32, 0.25, 1e-5);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, -12.375, 1e-6);
+    EXPECT_TRUE(position.status.in_position && position.status.reference_ended && position.status.active);
+    EXPECT_EQ(position.status.reference, int64_t(-12.375 * REV_32));
+}
+
+TEST_F(PositionLoop, is_followed_outside_of_position_mode_and_by_hand) {
+    for (int k = 0; k < 2000; k++) {
+        rotor_rev += 0.01;
+        const position_sample_t now = sample();
+        position_follow(&position, &now);
+        ASSERT_NEAR(position_rev(), rotor_rev, 1e-6);
+        ASSERT_FALSE(position.status.active);
+        ASSERT_EQ(position.status.reference, position.status.position);
+    }
+}
+
+TEST_F(PositionLoop, a_turning_rotor_is_taken_over_at_its_speed) {
+    speed_rev_s = 20.0;
+    order(POSITION_ORDER_PROFILE, 30.0);
+    step();
+    EXPECT_NEAR(out.speed_q22 / 4194304.0 / (2.0 * PI), 20.0, 0.2); // the gain, of a period's way
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 30.0, 1e-6);
+}
+
+TEST_F(PositionLoop, end_stops_bound_every_order) {
+    order(POSITION_ORDER_PROFILE, 5000.0);
+    double highest = 0.0;
+    for (int k = 0; k < 7000; k++) {
+        ticks(1);
+        highest = std::max(highest, rotor_rev);
+    }
+    EXPECT_NEAR(rotor_rev, 100.0, 1e-6);
+    EXPECT_LT(highest, 100.0001);
+    EXPECT_TRUE(position.status.limited);
+    for (int k = 0; k < 1200; k++) { // beyond the stop and back, 25 rev/s
+        order(POSITION_ORDER_CYCLIC, 95.0 + 0.1 * std::min(k, 200));
+        ticks(4);
+        highest = std::max(highest, rotor_rev);
+    }
+    EXPECT_LT(highest, 100.0001);
+    order(POSITION_ORDER_PROFILE, 0.0);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 0.0, 1e-6);
+    EXPECT_FALSE(position.status.limited);
+}
+
+TEST_F(PositionLoop, halt_stops_by_the_profile_and_holds) {
+    order(POSITION_ORDER_PROFILE, 50.0);
+    ticks(150);
+    const double speed = speed_rev_s, from = rotor_rev;
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(600);
+    EXPECT_GT(speed, 8.0);
+    EXPECT_NEAR(speed_rev_s, 0.0, 1e-3);
+    EXPECT_NEAR(rotor_rev - from, speed * speed / 2.0 / 100.0 + speed * 0.01, 0.3 * (rotor_rev - from));
+    const double held = rotor_rev;
+    ticks(200);
+    EXPECT_NEAR(rotor_rev, held, 1e-6);
+}
+
+TEST_F(PositionLoop, cyclic_targets_are_reached_a_cycle_later) {
+    const double amplitude = 0.5, frequency = 2.0;
+    double worst = 0.0;
+    for (int k = 0; k < 1000; k++) {
+        const double time = k * 0.004;
+        order(POSITION_ORDER_CYCLIC, 0.25 + amplitude * std::sin(2.0 * PI * frequency * time) * std::min(1.0, time));
+        for (int tick = 0; tick < 4; tick++) {
+            ticks(1);
+            const double at = time + tick * 0.001 - 0.004;
+            const double expected =
+                0.25 + amplitude * std::sin(2.0 * PI * frequency * at) * std::min(1.0, std::max(at, 0.0));
+            worst = k > 300 ? std::max(worst, std::fabs(double(position.status.reference) / REV_32 - expected)) : worst;
+        }
+    }
+    EXPECT_LT(worst, amplitude * 2.0 * PI * frequency * 0.0011 + 1e-4); // within the last tick
+}
+
+TEST_F(PositionLoop, a_jump_of_a_cyclic_target_is_approached_within_the_limits) {
+    order(POSITION_ORDER_CYCLIC, 0.25);
+    ticks(4);
+    int64_t speed = 0, acceleration = 0;
+    for (int k = 0; k < 400; k++) {
+        order(POSITION_ORDER_CYCLIC, k < 5 ? 0.25 : 3.0);
+        for (int tick = 0; tick < 4; tick++) {
+            ticks(1);
+            speed = std::max(speed, std::abs(position.profile.end.v));
+            acceleration = std::max(acceleration, std::abs(position.profile.end.a));
+        }
+    }
+    EXPECT_NEAR(rotor_rev, 3.0, 1e-6);
+    EXPECT_LE(acceleration, parameters.limits.acceleration + parameters.limits.acceleration / 1000);
+    EXPECT_LE(speed, parameters.limits.speed);
+}
+
+TEST_F(PositionLoop, a_sender_of_cyclic_targets_that_ceases_is_a_stop_by_the_profile) {
+    for (int k = 0; k < 250; k++) {
+        order(POSITION_ORDER_CYCLIC, 0.25 + 0.00002 * k * k);
+        ticks(4);
+    }
+    const double speed = speed_rev_s, from = rotor_rev;
+    EXPECT_GT(speed, 1.5);
+    ticks(12);
+    EXPECT_GT(speed_rev_s, 0.8 * speed); // two cycles more
+    ticks(300);
+    EXPECT_NEAR(speed_rev_s, 0.0, 1e-3);
+    EXPECT_LT(rotor_rev - from, speed * 0.012 + speed * speed / 2.0 / 90.0 + speed * 0.015);
+}
+
+TEST_F(PositionLoop, a_following_error_is_a_controlled_stop_until_a_halt) {
+    highest_rev = 2.0;
+    order(POSITION_ORDER_PROFILE, 5.0);
+    ticks(1000);
+    EXPECT_TRUE(position.status.following_error);
+    EXPECT_LT(std::fabs(out.speed_q22 / 4194304.0), 1.0); // does not press on
+    EXPECT_LT(std::fabs(double(position.status.error)), 0.13 * REV_32);
+    order(POSITION_ORDER_PROFILE, 0.0);
+    ticks(500);
+    EXPECT_TRUE(position.status.following_error);
+    EXPECT_NEAR(rotor_rev, 2.0, 0.01);
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(5);
+    EXPECT_FALSE(position.status.following_error);
+    order(POSITION_ORDER_PROFILE, 0.0);
+    ticks(1000);
+    EXPECT_NEAR(rotor_rev, 0.0, 1e-6);
+}
+
+TEST_F(PositionLoop, homing_here_calls_the_place_the_target_and_moves_nothing) {
+    order(POSITION_ORDER_HOME, 7.0);
+    ticks(20);
+    EXPECT_NEAR(rotor_rev, 0.25, 1e-5);
+    EXPECT_NEAR(position_rev(), 7.0, 1e-5);
+    EXPECT_TRUE(position.status.homed);
+    EXPECT_FALSE(position.status.homing || position.status.homing_failed);
+    order(POSITION_ORDER_PROFILE, 8.0);
+    ticks(1000);
+    EXPECT_NEAR(rotor_rev, 1.25, 1e-5);
+}
+
+TEST_F(PositionLoop, homing_by_the_index_returns_to_it_from_either_side) {
+    for (const position_homing_t method : {POSITION_HOMING_INDEX_FORWARD, POSITION_HOMING_INDEX_BACKWARD}) {
+        order(POSITION_ORDER_HALT, 0.0);
+        ticks(2);
+        order(POSITION_ORDER_PROFILE, position_rev() + 0.3); // off the index
+        ticks(800);
+        const double before = rotor_rev;
+        order(POSITION_ORDER_HOME, -3.0, method);
+        ticks(1500);
+        EXPECT_TRUE(position.status.homed) << method;
+        EXPECT_FALSE(position.status.homing || position.status.homing_failed) << method;
+        EXPECT_NEAR(rotor_rev, method == POSITION_HOMING_INDEX_FORWARD ? std::ceil(before) : std::floor(before), 1e-5);
+        EXPECT_NEAR(position_rev(), -3.0, 1e-5);
+    }
+}
+
+TEST_F(PositionLoop, homing_by_a_stop_finds_it_and_holds_there) {
+    lowest_rev = -1.4;
+    order(POSITION_ORDER_HOME, 0.5, POSITION_HOMING_STOP_BACKWARD);
+    ticks(10);
+    EXPECT_TRUE(position.status.homing && position_seeks_stop(&position));
+    ticks(1400);
+    EXPECT_TRUE(position.status.homed);
+    EXPECT_FALSE(position.status.homing || position.status.homing_failed || position.status.following_error);
+    EXPECT_NEAR(position_rev(), 0.5, 1e-4);
+    order(POSITION_ORDER_PROFILE, 1.5);
+    ticks(1000);
+    EXPECT_NEAR(rotor_rev, -0.4, 1e-4);
+}
+
+TEST_F(PositionLoop, a_homing_that_another_order_or_the_end_of_the_run_interrupts_has_failed) {
+    order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_STOP_FORWARD);
+    ticks(50);
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(300);
+    EXPECT_TRUE(position.status.homing_failed);
+    EXPECT_FALSE(position.status.homed);
+    EXPECT_NEAR(speed_rev_s, 0.0, 1e-3);
+    order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_STOP_FORWARD);
+    ticks(50);
+    EXPECT_FALSE(position.status.homing_failed);
+    const position_sample_t now = sample();
+    position_follow(&position, &now);
+    EXPECT_TRUE(position.status.homing_failed);
+}
+
+TEST_F(PositionLoop, any_set_points_keep_the_limits_and_the_formats) {
+    std::mt19937_64 random(5);
+    highest_rev = 200.0;
+    lowest_rev = -200.0;
+    for (int k = 0; k < 3000; k++) {
+        position_set_point_t set_point = {};
+        set_point.order = position_order_t(random() % 4);
+        set_point.homing = position_homing_t(random() % 6);
+        set_point.sequence = uint32_t(random());
+        set_point.target = random() % 8 ? int64_t(random() >> (random() % 34)) : random() % 2 ? INT64_MIN : INT64_MAX;
+        set_point.speed_q22 = int32_t(random());
+        set_point.acceleration_rpm_s = int32_t(random() >> (random() % 32));
+        set_point.jerk_rpm_s2 = int32_t(random());
+        command = position_command(&parameters, &set_point);
+        ticks(1 + int(random() % 8));
+        ASSERT_LE(std::abs(position.profile.end.v), PROFILE_SPEED_MAX);
+        ASSERT_LE(std::abs(position.profile.end.x), PROFILE_POSITION_MAX);
+        ASSERT_LE(std::abs(position.status.position), POSITION_MAX + POSITION_ONE_REV);
+    }
+}
+
+TEST_F(PositionLoop, the_end_of_the_range_of_positions_begins_a_new_one) {
+    const position_sample_t now = sample();
+    position_follow(&position, &now);
+    position.counted = POSITION_MAX - 10;
+    position.zero = 0;
+    position.status.homed = true;
+    for (int k = 0; k < 10; k++) {
+        rotor_rev += 0.1;
+        const position_sample_t next = sample();
+        position_follow(&position, &next);
+        ASSERT_LE(std::abs(position.status.position), POSITION_MAX);
+    }
+    EXPECT_FALSE(position.status.homed);
+    EXPECT_LT(position_rev(), 2.0);
+}
+
+} // namespace
