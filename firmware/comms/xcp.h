@@ -40,7 +40,7 @@
 
 #define XCP_SILENT_US 10000000u
 #define XCP_ODTS_MAX SAMPLER_CHANNELS_MAX
-#define XCP_EVENTS 2u /* of sampler_event_t */
+#define XCP_EVENTS 3u /* of sampler_event_t */
 #define XCP_TEXT_BYTES 32u
 
 #define XCP_AREA 0xF0000000u /* bits of an address that select the area */

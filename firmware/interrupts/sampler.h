@@ -26,7 +26,11 @@ typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
 #define SAMPLER_WORDS 4096u
 #endif
 
-typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_BACKGROUND } sampler_event_t;
+typedef enum {
+    SAMPLER_EVENT_CONTROL = 1,
+    SAMPLER_EVENT_BACKGROUND,
+    SAMPLER_EVENT_IDENTIFY /* control periods that belong into the record of an experiment (control/identify.h) */
+} sampler_event_t;
 
 typedef enum {
     SAMPLER_AT_ONCE,  /* at the next event */
