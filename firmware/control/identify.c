@@ -7,9 +7,9 @@
 /* Currents below this part of the limit are none. */
 #define NONE_SHIFT 7
 #define REST_PERIODS 4u
-/* Periods of freewheeling that are all recorded, and then one in so many. */
-#define FREEWHEEL_ALL 8u
-#define FREEWHEEL_EACH 16u
+/* Records of a pulse: after that part of the limit, or so many periods. */
+#define RECORD_SHIFT 5
+#define PULSE_SPACING 16u
 #define MARK_PERIODS 32u
 /* Of a hold: the error of the current is removed in so many periods, at most at a quarter of full voltage. */
 #define HOLD_SHIFT 2
@@ -151,7 +151,7 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
     const uint32_t time = command->time_ms * parameters->periods_per_ms;
     const int32_t level_q9 = (parameters->limit_q9 * command->level_q12) >> 12;
     if (identify->state == IDENTIFY_WAITS) {
-        if (!in_window(command, identify->angle)) {
+        if (current_q9 > parameters->limit_q9 >> NONE_SHIFT || !in_window(command, identify->angle)) {
             if (identify->periods > time) {
                 enter(identify, IDENTIFY_IDLE);
             }
@@ -186,21 +186,29 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
     return IDENTIFY_OFF;
 }
 
-static bool due(identify_t *identify, uint32_t periods) {
-    if (identify->decimation > 1u) {
-        identify->decimation--;
+/* Of a pulse the periods in which the switches or the state are others than in the period before, and where the current
+ * has changed by a part of the limit since the last record: few enough for the bus, and none is missed by which the
+ * voltage or its integral would be another one. */
+static bool is_due(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
+    const bool pulses = identify->state >= IDENTIFY_CHARGES && identify->state <= IDENTIFY_RESTS;
+    const uint32_t spacing = pulses ? PULSE_SPACING : parameters->periods_per_ms;
+    const bool changed = identify->state != identify->recorded_state || identify->action != identify->recorded_action ||
+                         fixed_abs(current_q9 - identify->recorded_q9) > parameters->limit_q9 >> RECORD_SHIFT;
+    identify->recorded_periods++;
+    if (identify->recorded_periods < spacing && !(pulses && changed) &&
+        (identify->state == IDENTIFY_RESTS) == (identify->recorded_state == IDENTIFY_RESTS)) {
         return false;
     }
-    identify->decimation = periods;
+    identify->recorded_periods = 0;
+    identify->recorded_state = identify->state;
+    identify->recorded_action = identify->action;
+    identify->recorded_q9 = current_q9;
     return true;
 }
 
 static void write_record(const identify_parameters_t *parameters, identify_t *identify,
                          const identify_sample_t *sample, unsigned phase) {
-    const bool freewheels = identify->state == IDENTIFY_FREEWHEELS && identify->periods > FREEWHEEL_ALL;
-    const bool pulses = identify->state >= IDENTIFY_CHARGES && identify->state <= IDENTIFY_RESTS && !freewheels;
-    const bool is_due = due(identify, freewheels ? FREEWHEEL_EACH : parameters->periods_per_ms);
-    identify->records = pulses || is_due;
+    identify->records = is_due(parameters, identify, sample->current_q9[phase]);
     uint32_t word = sample->angle >> (32u - IDENTIFY_RECORD_ANGLE_BITS);
     word = (word << IDENTIFY_RECORD_PHASE_BITS) | phase;
     word = (word << IDENTIFY_RECORD_ACTION_BITS) | identify->action;

@@ -71,14 +71,16 @@ typedef struct {
     identify_command_t command; /* written by the background with the interrupts masked */
     uint32_t record[2];         /* of the last period, below */
     bool begun;                 /* in this run */
-    bool records;               /* it belongs into the record: each period of a pulse, and one in a millisecond */
+    bool records;               /* it belongs into the record, in which an idle drive has one in a millisecond */
     uint8_t number;             /* of the experiment */
     uint8_t state;              /* identify_state_t */
     uint8_t action, acted;      /* identify_action_t, of the period after the last sample, and before it */
     uint8_t limit;              /* identify_limit_t that has ended the experiments */
     uint32_t periods;           /* since the state */
     uint32_t run_periods;       /* since the begin of the run */
-    uint32_t decimation;        /* periods to the next record */
+    uint32_t recorded_periods;  /* since the last record, and its values: */
+    int32_t recorded_q9;
+    uint8_t recorded_state, recorded_action;
     uint32_t angle, mark[2];    /* of the last sample, and at 32 to 96 periods before it */
     int32_t travel;             /* 2^-16 rev, saturated */
     int32_t previous_q9;        /* current of the phase at the last sample */

@@ -1,0 +1,189 @@
+"""The electrical part of the machine from the pulses, as one least-squares problem:
+
+    integral of s Vdc dt = psi(theta - delta, i) + R integral of i dt + 2 V t
+
+s is +1 with both switches on, 0 freewheeling, -1 with both off. psi is linear in the coefficients of its spline, and so
+are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newton) add what is not: the angle of each phase,
+the delay of the current sensors, their offsets, the eccentricity of the encoder.
+
+Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and what
+the drop of a switch differs from that of a diode.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as linalg
+import scipy.sparse as sparse
+
+from salient.identify.basis import FluxBasis
+from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
+from salient.identify.sequence import Findings, Pulse
+
+ANGLES, CURRENTS = 48, 24
+_ITERATIONS = 5
+_ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
+"""Of the roughness, relative to the mean weight of a coefficient."""
+_DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
+"""Deviations of weak priors, for what a machine may not show."""
+_BEGIN_PART = 0.03
+_SIGN = {OFF: -1.0, ZERO: 0.0, ON: 1.0}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Samples of pulses. angle_rad: from the rough aligned angle; shaft_rad: of the encoder; flux_Wb: integral of the
+    voltage; charge_As: of the current; time_s: since the begin of the pulse; slope_A_s: of the current before the
+    sample; pulse: number."""
+
+    pulse: np.ndarray
+    row: np.ndarray
+    angle_rad: np.ndarray
+    shaft_rad: np.ndarray
+    current_A: np.ndarray
+    flux_Wb: np.ndarray
+    charge_As: np.ndarray
+    time_s: np.ndarray
+    slope_A_s: np.ndarray
+
+    def take(self, pulses: np.ndarray) -> Rows:
+        """The rows of pulses by number, one as often as it is named, numbered anew."""
+        order = np.argsort(self.pulse, kind="stable")
+        begin = np.searchsorted(self.pulse[order], pulses)
+        end = np.searchsorted(self.pulse[order], pulses, "right")
+        index = np.concatenate([order[a:b] for a, b in zip(begin, end, strict=True)])
+        numbers = np.repeat(np.arange(len(pulses)), end - begin)
+        return Rows(numbers, *(getattr(self, name)[index] for name in list(vars(self))[1:]))
+
+
+def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
+    """The samples with current of pulses."""
+    parts: list[list[np.ndarray]] = []
+    for number, pulse in enumerate(pulses):
+        part = _rows(found, pulse)
+        if part is not None:
+            parts.append([np.full(len(part[0]), number), np.full(len(part[0]), found.phases.index(pulse.phase)), *part])
+    if not parts:
+        raise IdentifyError("no pulse has a current")
+    return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
+    log = pulse.log
+    current = log["current_A"] - found.offset_A[pulse.phase]
+    on = np.nonzero(log["action"] == ON)[0]
+    if not len(on) or (log["action"] == PART).any():
+        return None
+    if on[0] == 0 or current[on[0]] > _BEGIN_PART * current.max():  # it began with the current of another one
+        return None
+    floor_A = 4.0 * found.noise_A[pulse.phase] + 0.01 * current.max()
+    first = on[0]
+    dead = np.nonzero(current[first + 1:] <= floor_A)[0]
+    late = dead[dead + first + 1 > np.argmax(current)]
+    last = first + (int(late[0]) if len(late) else len(current) - 1 - first)
+    if last <= first + 1:
+        return None
+    step_s = np.diff(log["time_us"][first:last + 1]) * 1e-6
+    sign = np.vectorize(_SIGN.get, otypes=[float])(log["action"][first:last])
+    voltage = (log["dc_link_V"][first:last] + log["dc_link_V"][first + 1:last + 1]) / 2.0
+    mean_A = (current[first:last] + current[first + 1:last + 1]) / 2.0
+    flux, charge, time_s = np.cumsum(sign * voltage * step_s), np.cumsum(mean_A * step_s), np.cumsum(step_s)
+    turn = log["turn"][first + 1:last + 1]
+    live = current[first + 1:last + 1] > floor_A
+    at = np.arange(first + 1, last + 1)
+    slope = (current[at] - current[at - 1]) / step_s
+    columns = [2.0 * math.pi * (turn - found.position[pulse.phase]), 2.0 * math.pi * turn, current[at], flux, charge,
+               time_s, slope]
+    return [column[live] for column in columns]
+
+
+@dataclass
+class Fit:
+    """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
+    device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest."""
+
+    basis: FluxBasis
+    coefficients: np.ndarray
+    resistance_ohm: float
+    drop_V: float
+    delta_rad: np.ndarray
+    eccentricity_rad: np.ndarray
+    delay_s: float
+    offset_A: np.ndarray
+    residual_Wb: np.ndarray
+
+    def flux_Wb(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
+        """Flux linkage at an angle from aligned."""
+        return self.basis.value(self.coefficients, angle_rad, current_A)
+
+    def torque_Nm(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
+        """Derivative of the co-energy by the angle."""
+        return self.basis.value(self.coefficients, angle_rad, current_A, 1, -1)
+
+    def shaft_rad(self, encoder_rad: np.ndarray) -> np.ndarray:
+        """Angle of the shaft by that of the encoder."""
+        cosine, sine = self.eccentricity_rad
+        return np.asarray(encoder_rad - cosine * np.cos(encoder_rad) - sine * np.sin(encoder_rad))
+
+
+def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, start: Fit | None = None,
+          iterations: int = _ITERATIONS, angles: int = ANGLES, currents: int = CURRENTS) -> Fit:
+    """The machine that explains the rows best. start: of other rows of the same machine, which saves iterations."""
+    basis = FluxBasis(rotor_poles, current_max_A, angles, currents) if start is None else start.basis
+    fit = start or Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
+                       np.zeros(0))
+    rough = basis.roughness()
+    for iteration in range(iterations):
+        fit = _step(rows, phases, fit, rough, linear=start is None and iteration == 0)
+    return fit
+
+
+def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Angles from aligned and currents of the rows with what is known of the sensors."""
+    cosine, sine = fit.eccentricity_rad
+    angle = (rows.angle_rad - fit.delta_rad[rows.row] - cosine * np.cos(rows.shaft_rad) - sine * np.sin(rows.shaft_rad))
+    return angle, np.maximum(rows.current_A + fit.offset_A[rows.row] + fit.delay_s * rows.slope_A_s, 0.0)
+
+
+def _step(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> Fit:
+    """One least-squares problem, about the present angles, delay and offsets unless `linear`."""
+    basis, n = fit.basis, fit.basis.size
+    angle, current = _corrected(rows, fit)
+    columns = [rows.charge_As, 2.0 * rows.time_s]
+    deviations = [math.inf, _DROP_V]
+    if not linear:
+        by_angle = basis.value(fit.coefficients, angle, current, 1, 0)
+        by_current = basis.value(fit.coefficients, angle, current, 0, 1)
+        of_phase = [(rows.row == row).astype(float) for row in range(phases)]
+        columns += [-by_angle * each for each in of_phase]
+        columns += [-by_angle * np.cos(rows.shaft_rad), -by_angle * np.sin(rows.shaft_rad), by_current * rows.slope_A_s]
+        columns += [by_current * each for each in of_phase]
+        deviations += [math.inf] * phases + [_ECCENTRICITY_RAD] * 2 + [_DELAY_S]
+        deviations += [_OFFSET_PART * basis.current_max_A] * phases
+    design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
+    normal = (design.T @ design).toarray()
+    right = design.T @ rows.flux_Wb
+    scale = float(np.trace(normal[:n, :n])) / n
+    normal[:n, :n] += scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
+    noise = float(np.mean(fit.residual_Wb**2)) if len(fit.residual_Wb) == len(rows.flux_Wb) else \
+        (2e-4 * float(np.abs(rows.flux_Wb).max())) ** 2
+    known = np.zeros(len(columns)) if linear else np.concatenate(
+        [[0.0, 0.0], np.zeros(phases), -fit.eccentricity_rad, [-fit.delay_s], -fit.offset_A])
+    for k, deviation in enumerate(deviations):
+        normal[n + k, n + k] += noise / deviation**2 if math.isfinite(deviation) else 1e-12 * normal[n + k, n + k]
+        right[n + k] += known[k] * noise / deviation**2 if math.isfinite(deviation) else 0.0
+    try:
+        x = linalg.solve(normal, right, assume_a="pos", check_finite=False)
+    except linalg.LinAlgError:
+        raise IdentifyError("the pulses do not determine the machine") from None
+    residual = rows.flux_Wb - design @ x
+    more = x[n + 2:]
+    if linear:
+        more = np.zeros(2 * phases + 3)
+    return Fit(basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
+               fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
+               fit.offset_A + more[phases + 3:], residual)
