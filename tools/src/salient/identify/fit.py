@@ -50,15 +50,6 @@ class Rows:
     time_s: np.ndarray
     slope_A_s: np.ndarray
 
-    def take(self, pulses: np.ndarray) -> Rows:
-        """The rows of pulses by number, one as often as it is named, numbered anew."""
-        order = np.argsort(self.pulse, kind="stable")
-        begin = np.searchsorted(self.pulse[order], pulses)
-        end = np.searchsorted(self.pulse[order], pulses, "right")
-        index = np.concatenate([order[a:b] for a, b in zip(begin, end, strict=True)])
-        numbers = np.repeat(np.arange(len(pulses)), end - begin)
-        return Rows(numbers, *(getattr(self, name)[index] for name in list(vars(self))[1:]))
-
 
 def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
     """The samples with current of pulses."""
@@ -130,15 +121,15 @@ class Fit:
         return np.asarray(encoder_rad - cosine * np.cos(encoder_rad) - sine * np.sin(encoder_rad))
 
 
-def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, start: Fit | None = None,
-          iterations: int = _ITERATIONS, angles: int = ANGLES, currents: int = CURRENTS) -> Fit:
-    """The machine that explains the rows best. start: of other rows of the same machine, which saves iterations."""
-    basis = FluxBasis(rotor_poles, current_max_A, angles, currents) if start is None else start.basis
-    fit = start or Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
-                       np.zeros(0))
+def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angles: int = ANGLES,
+          currents: int = CURRENTS) -> Fit:
+    """The machine that explains the rows best."""
+    basis = FluxBasis(rotor_poles, current_max_A, angles, currents)
+    fit = Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
+              np.zeros(0))
     rough = basis.roughness()
-    for iteration in range(iterations):
-        fit = _step(rows, phases, fit, rough, linear=start is None and iteration == 0)
+    for iteration in range(_ITERATIONS):
+        fit = _solution(_problem(rows, phases, fit, rough, linear=iteration == 0), rows, phases)
     return fit
 
 
@@ -149,12 +140,25 @@ def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     return angle, np.maximum(rows.current_A + fit.offset_A[rows.row] + fit.delay_s * rows.slope_A_s, 0.0)
 
 
-def _step(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> Fit:
-    """One least-squares problem, about the present angles, delay and offsets unless `linear`."""
+@dataclass(frozen=True)
+class _Problem:
+    """A least-squares problem about a fit. forms: of the roughness, weighted; known, deviations: of the priors of the
+    further columns."""
+
+    fit: Fit
+    design: sparse.csr_matrix
+    forms: np.ndarray
+    known: np.ndarray
+    deviations: np.ndarray
+    linear: bool
+
+
+def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> _Problem:
+    """About the present angles, delay and offsets unless `linear`."""
     basis, n = fit.basis, fit.basis.size
     angle, current = _corrected(rows, fit)
     columns = [rows.charge_As, 2.0 * rows.time_s]
-    deviations = [math.inf, _DROP_V]
+    deviations, known = [math.inf, _DROP_V], [0.0, 0.0]
     if not linear:
         by_angle = basis.value(fit.coefficients, angle, current, 1, 0)
         by_current = basis.value(fit.coefficients, angle, current, 0, 1)
@@ -164,26 +168,40 @@ def _step(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray
         columns += [by_current * each for each in of_phase]
         deviations += [math.inf] * phases + [_ECCENTRICITY_RAD] * 2 + [_DELAY_S]
         deviations += [_OFFSET_PART * basis.current_max_A] * phases
+        known += [0.0] * phases + [*-fit.eccentricity_rad, -fit.delay_s, *-fit.offset_A]
     design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
-    normal = (design.T @ design).toarray()
-    right = design.T @ rows.flux_Wb
-    scale = float(np.trace(normal[:n, :n])) / n
-    normal[:n, :n] += scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
+    scale = float(design[:, :n].multiply(design[:, :n]).sum()) / n
+    forms = scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
+    return _Problem(fit, design, forms, np.array(known), np.array(deviations), linear)
+
+
+def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | None = None) -> Fit:
+    """The fit of a problem, with a weight of each row. IdentifyError: the pulses do not determine the machine."""
+    fit, design = problem.fit, problem.design
+    n = fit.basis.size
+    weighted = design if weights is None else design.multiply(weights[:, None]).tocsr()
+    normal, right = (weighted.T @ design).toarray(), weighted.T @ rows.flux_Wb
+    normal[:n, :n] += problem.forms
     noise = float(np.mean(fit.residual_Wb**2)) if len(fit.residual_Wb) == len(rows.flux_Wb) else \
         (2e-4 * float(np.abs(rows.flux_Wb).max())) ** 2
-    known = np.zeros(len(columns)) if linear else np.concatenate(
-        [[0.0, 0.0], np.zeros(phases), -fit.eccentricity_rad, [-fit.delay_s], -fit.offset_A])
-    for k, deviation in enumerate(deviations):
-        normal[n + k, n + k] += noise / deviation**2 if math.isfinite(deviation) else 1e-12 * normal[n + k, n + k]
-        right[n + k] += known[k] * noise / deviation**2 if math.isfinite(deviation) else 0.0
+    for k, deviation in enumerate(problem.deviations, start=n):
+        normal[k, k] += 1e-12 * normal[k, k] if math.isinf(deviation) else noise / deviation**2
+        right[k] += 0.0 if math.isinf(deviation) else problem.known[k - n] * noise / deviation**2
     try:
         x = linalg.solve(normal, right, assume_a="pos", check_finite=False)
     except linalg.LinAlgError:
         raise IdentifyError("the pulses do not determine the machine") from None
-    residual = rows.flux_Wb - design @ x
-    more = x[n + 2:]
-    if linear:
-        more = np.zeros(2 * phases + 3)
-    return Fit(basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
+    more = np.zeros(2 * phases + 3) if problem.linear else x[n + 2:]
+    return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
                fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
-               fit.offset_A + more[phases + 3:], residual)
+               fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x)
+
+
+def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:
+    """The fit of pulses drawn with repetition, once in each sample: its scatter is that of the result, whatever
+    correlates the rows of a pulse."""
+    problem = _problem(rows, phases, fit, fit.basis.roughness(), linear=False)
+    random = np.random.default_rng(seed)
+    pulses = int(rows.pulse.max()) + 1
+    return [_solution(problem, rows, phases, random.multinomial(pulses, np.full(pulses, 1.0 / pulses))[rows.pulse]
+                      .astype(float)) for _ in range(samples)]

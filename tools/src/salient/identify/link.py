@@ -29,8 +29,10 @@ IDLE, HOLDS, WAITS, CHARGES, FREEWHEELS, DISCHARGES, RESTS, ENDED = range(8)
 """identify_state_t."""
 OFF, ZERO, ON, PART = range(4)
 """identify_action_t."""
-LIMITS = ("none", "current", "copper loss", "travel", "time", "controller")
-"""identify_limit_t."""
+LIMITS = ("none", "a current is more than 3 % beyond current_limit_A", "a winding has had its copper loss",
+          "the rotor has turned by 256 revolutions", "they last longer than 120 s",
+          "the parameter controller must be salient")
+"""Reasons by identify_limit_t."""
 _EVENT_IDENTIFY = 2
 _TIMESTAMP = 0x10
 _ANGLE_BITS, _NUMBER_MASK = 20, 15
@@ -98,7 +100,7 @@ class Link:
             raise IdentifyError(f"the drive has ended the experiments by the fault {drive.fault}")
         limit = self._member("identify.limit")
         if limit:
-            raise IdentifyError(f"the drive has ended the experiments: limit of {LIMITS[limit]}")
+            raise IdentifyError(f"the drive has ended the experiments: {LIMITS[limit]}")
         lost = self._member("sampler.lost")
         if lost:
             raise IdentifyError(f"{lost} records were lost: the bus has no room for them")
