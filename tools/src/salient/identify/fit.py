@@ -31,6 +31,13 @@ _ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
 _DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
 """Deviations of weak priors, for what a machine may not show."""
 _BEGIN_PART = 0.03
+_MOST = 0.2
+"""Part of the pulses that may end at less than the map."""
+_INITIAL_PART, _LEAST_PART = 0.1, 0.1
+"""The least incremental inductance is that part of the one of the unaligned phase, which is read at that part of the
+largest current."""
+_SIGN_WEIGHT, _SIGN_ROUNDS = 10.0, 8
+"""Weight of a sign, relative to the samples; rounds in which more of them may appear."""
 _SIGN = {OFF: -1.0, ZERO: 0.0, ON: 1.0}
 
 
@@ -61,6 +68,17 @@ def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
     if not parts:
         raise IdentifyError("no pulse has a current")
     return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def within(rows: Rows, current_A: float) -> Rows:
+    """The rows up to a current."""
+    kept = rows.current_A <= current_A
+    return Rows(*(column[kept] for column in vars(rows).values()))
+
+
+def common_current_A(pulses: Sequence[Pulse]) -> float:
+    """Largest current of most pulses; beyond, only some angles would have samples."""
+    return float(np.quantile([pulse.log["current_A"].max() for pulse in pulses if pulse.mapped], _MOST))
 
 
 def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
@@ -151,6 +169,18 @@ class _Problem:
     known: np.ndarray
     deviations: np.ndarray
     linear: bool
+    signs: sparse.csr_matrix
+    least: np.ndarray
+
+
+def _signs(basis: FluxBasis) -> sparse.csr_matrix:
+    """What no machine has negative, on a grid of both directions: the incremental inductance, scaled by the largest
+    current, and the fall of the flux linkage from aligned to unaligned, by the pitch."""
+    angle, current = np.meshgrid(np.linspace(0.0, math.pi / basis.rotor_poles, basis.angles + 1),
+                                 np.linspace(0.0, basis.current_max_A, basis.columns), indexing="ij")
+    rises = basis.design(angle.ravel(), current.ravel(), 0, 1) * basis.current_max_A
+    falls = basis.design(angle[1:-1, 1:].ravel(), current[1:-1, 1:].ravel(), 1, 0) * (-math.pi / basis.rotor_poles)
+    return sparse.vstack([rises, falls]).tocsr()
 
 
 def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> _Problem:
@@ -172,7 +202,13 @@ def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndar
     design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
     scale = float(design[:, :n].multiply(design[:, :n]).sum()) / n
     forms = scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
-    return _Problem(fit, design, forms, np.array(known), np.array(deviations), linear)
+    signs = _signs(basis)
+    least = np.zeros(signs.shape[0])
+    if not linear:
+        unaligned = float(basis.value(fit.coefficients, np.array(math.pi / basis.rotor_poles),
+                                      np.array(_INITIAL_PART * basis.current_max_A))) / _INITIAL_PART
+        least[:basis.rows * basis.columns] = _LEAST_PART * max(unaligned, 0.0)
+    return _Problem(fit, design, forms, np.array(known), np.array(deviations), linear, signs, least)
 
 
 def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | None = None) -> Fit:
@@ -187,14 +223,34 @@ def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | 
     for k, deviation in enumerate(problem.deviations, start=n):
         normal[k, k] += 1e-12 * normal[k, k] if math.isinf(deviation) else noise / deviation**2
         right[k] += 0.0 if math.isinf(deviation) else problem.known[k - n] * noise / deviation**2
-    try:
-        x = linalg.solve(normal, right, assume_a="pos", check_finite=False)
-    except linalg.LinAlgError:
-        raise IdentifyError("the pulses do not determine the machine") from None
+    x = _constrained(problem, normal, right, n)
     more = np.zeros(2 * phases + 3) if problem.linear else x[n + 2:]
     return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
                fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
                fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x)
+
+
+def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
+    """The solution whose signs are those of a machine: those that are not are drawn to their least value, with the
+    rest of the map. IdentifyError: there is none."""
+    signs, least = problem.signs, problem.least
+    weight = _SIGN_WEIGHT * float(np.trace(normal[:n, :n])) / float(signs.multiply(signs).sum())
+    active = np.zeros(signs.shape[0], bool)
+    for _ in range(_SIGN_ROUNDS):
+        held = signs[active]
+        of = normal.copy()
+        of[:n, :n] += weight * (held.T @ held).toarray()
+        more = right.copy()
+        more[:n] += weight * (held.T @ least[active])
+        try:
+            x = linalg.solve(of, more, assume_a="pos", check_finite=False)
+        except linalg.LinAlgError:
+            raise IdentifyError("the pulses do not determine the machine") from None
+        violated = (signs @ x[:n] < least) & ~active
+        if problem.linear or not violated.any():
+            return np.asarray(x)
+        active |= violated
+    return np.asarray(x)
 
 
 def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:

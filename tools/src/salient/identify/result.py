@@ -83,10 +83,9 @@ class Result:
 def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = SAMPLES) -> Result:
     """The machine by the experiments. IdentifyError: they do not determine it."""
     pulses = [pulse for pulse in found.pulses if pulse.log["time_us"][-1] <= found.mapped_us]
-    rows = electrical.rows_of(found, pulses)
-    phases = len(found.phases)
-    largest_A = float(rows.current_A.max())
-    fit = electrical.solve(rows, phases, found.rotor_poles, 1.001 * largest_A)
+    phases, largest_A = len(found.phases), electrical.common_current_A(pulses)
+    rows = electrical.within(electrical.rows_of(found, pulses), largest_A)
+    fit = electrical.solve(rows, phases, found.rotor_poles, largest_A)
     others = electrical.resampled(rows, phases, fit, samples)
     shaft = shaft_of(found, fit, log)
     angle, current = np.meshgrid(np.linspace(0.0, math.pi / found.rotor_poles, MAP_ANGLES),

@@ -29,9 +29,9 @@ _FREEWHEEL_MS = 50
 _LATENCY_S = 2.5e-3
 _SLOWEST, _FASTEST = 0.7, 1.2
 """Of the drift speed, between which it is kept."""
-_PATIENCE_S = 0.1
+_PATIENCE_S = 0.05
 """Wait for a window that is worth one pulse more of it."""
-_SPIN_UP_MAX_S, _COAST_S = 5.0, 1.0
+_SPIN_UP_MAX_S, _COAST_S = 2.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,10 @@ class Sequence:
                                   timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
             fired = log[log["state"] == CHARGES]
             if len(fired):
-                counts[row, int(found.electrical(phase, float(fired["turn"][0])) * bins) % bins] += 1
+                place = found.electrical(phase, float(fired["turn"][0])) * bins
+                # A pulse at the edge of a window is one of it, wherever the encoder's count begins.
+                near = abs((place - window - 0.5 + bins / 2.0) % bins - bins / 2.0) < 0.75
+                counts[row, window if near else int(place) % bins] += 1
             log = log if len(log) > 4 else link.rest(0.003)
             if link.time_s - told_s > 2.0:
                 told_s = link.time_s
