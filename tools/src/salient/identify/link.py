@@ -57,6 +57,7 @@ class Link:
         self.limit_A = float(session.drive.parameters["current_limit_A"])
         self._current_A = variables.quantity("control.measurement.current_q9[0]").factor
         self._voltage_V = variables.quantity("control.measurement.dc_link_voltage_q6").factor
+        self._middle_rev = self._member("control_parameters.encoder_middle") / (1 << 32)
         self._response_id = session.drive_database.get_message_by_name("XCP_RESPONSE").frame_id
         self._parts: list[np.ndarray] = []
         self._pending: bytes | None = None
@@ -132,7 +133,7 @@ class Link:
         full = 1 << _ANGLE_BITS
         turned = (np.diff(angle, prepend=self._turn % full) + full // 2) % full - full // 2
         turn = self._turn + np.cumsum(turned)
-        out["turn"] = turn / full
+        out["turn"] = turn / full + self._middle_rev
         out["phase"] = second >> 9 & 7
         out["action"] = second >> 7 & 3
         out["state"] = second >> 4 & 7

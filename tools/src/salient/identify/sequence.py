@@ -19,7 +19,7 @@ import numpy as np
 from salient.bench.drive import Experiment
 from salient.identify.link import CHARGES, FREEWHEELS, RESTS, IdentifyError, Link
 
-PULSE_LEVEL, HOLD_LEVEL, PROBE_LEVEL = 0.99, 0.3, 0.1
+PULSE_LEVEL, HOLD_LEVEL, PROBE_LEVEL = 4095 / 4096, 0.3, 0.1
 _STILL = 0.003 / (2.0 * math.pi)
 """Rotation below which the rotor has not moved, of a revolution."""
 _QUIET = 0.02
