@@ -248,8 +248,14 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, adc_A: flo
     }
     if plate.get("drive", {}).get("parameters"):
         tables["drive.parameters"] = plate["drive"]["parameters"]
-    name = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in path.stem)
-    lines = ["# Measured by the drive: tools/salient identify; board and ratings of its name plate.", f'name = "{name}"']
+    return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.", path.stem,
+                        tables)
+
+
+def machine_text(about: str, name: str, tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Text of a machine file. about: a comment at its top; tables: keys by the names of their tables."""
+    checked = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name)
+    lines = [f"# {about}", f'name = "{checked}"']
     for title, keys in tables.items():
         lines += ["", f"[{title}]", *(f"{key} = {_toml(value)}" for key, value in keys.items())]
     return "\n".join(lines) + "\n"
