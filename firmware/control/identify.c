@@ -33,7 +33,8 @@ static void end(identify_t *identify, identify_limit_t limit) {
 
 COLD void identify_begin(identify_t *identify, uint32_t angle, bool permitted) {
     const identify_command_t command = identify->command;
-    *identify = (identify_t){.command = command, .begun = true, .number = command.number, .angle = angle, .mark = {angle, angle}};
+    *identify = (identify_t){
+        .command = command, .begun = true, .number = command.number, .angle = angle, .mark = {angle, angle}};
     if (!permitted) {
         end(identify, IDENTIFY_CONTROLLER);
     }
@@ -206,8 +207,8 @@ static bool is_due(const identify_parameters_t *parameters, identify_t *identify
     return true;
 }
 
-static void write_record(const identify_parameters_t *parameters, identify_t *identify,
-                         const identify_sample_t *sample, unsigned phase) {
+static void write_record(const identify_parameters_t *parameters, identify_t *identify, const identify_sample_t *sample,
+                         unsigned phase) {
     identify->records = is_due(parameters, identify, sample->current_q9[phase]);
     uint32_t word = sample->angle >> (32u - IDENTIFY_RECORD_ANGLE_BITS);
     word = (word << IDENTIFY_RECORD_PHASE_BITS) | phase;

@@ -81,11 +81,11 @@ typedef struct {
     uint32_t recorded_periods;  /* since the last record, and its values: */
     int32_t recorded_q9;
     uint8_t recorded_state, recorded_action;
-    uint32_t angle, mark[2];    /* of the last sample, and at 32 to 96 periods before it */
-    int32_t travel;             /* 2^-16 rev, saturated */
-    int32_t previous_q9;        /* current of the phase at the last sample */
-    int32_t rise_q9;            /* of it in the last period at full voltage of this pulse; 0: none yet */
-    int32_t growth_q9;          /* of the rise, at least 0 */
+    uint32_t angle, mark[2];               /* of the last sample, and at 32 to 96 periods before it */
+    int32_t travel;                        /* 2^-16 rev, saturated */
+    int32_t previous_q9;                   /* current of the phase at the last sample */
+    int32_t rise_q9;                       /* of it in the last period at full voltage of this pulse; 0: none yet */
+    int32_t growth_q9;                     /* of the rise, at least 0 */
     int32_t first_rise_q9[HAL_PHASES_MAX]; /* largest one of a pulse's first period; 0: not known */
     uint32_t energy[HAL_PHASES_MAX];       /* sum of squares of currents, 2^-2 A^2 periods */
 } identify_t;

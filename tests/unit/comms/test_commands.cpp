@@ -8,8 +8,8 @@
 extern "C" {
 #include "comms/arming.h"
 #include "comms/commands.h"
-#include "control/machine_tables.h"
 #include "comms/counter.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "hal_random.h"
 #include "storage/parameters.h"

@@ -134,14 +134,14 @@ TEST_F(Xcp, identifies_program_and_events_by_texts) {
     for (const unsigned type : {2, 3, 4, 6, 128, 255}) {
         EXPECT_EQ(send({0xFA, uint8_t(type)}), (bytes_t{0xFF, 0, 0, 0, 0, 0, 0, 0})) << "there is none";
     }
-    const char *names[] = {"control", "background"};
-    for (unsigned event = 0; event < 2; event++) {
+    const char *names[] = {"control", "background", "identify"};
+    for (unsigned event = 0; event < XCP_EVENTS; event++) {
         const std::string name = names[event];
         EXPECT_EQ(send({0xD7, 0, uint8_t(event), 0}), (bytes_t{0xFF, 0x04, 1, uint8_t(name.size()), 0, 0, 0}));
         const bytes_t text = upload(unsigned(name.size()));
         EXPECT_EQ(std::string(text.begin(), text.end()), name);
     }
-    EXPECT_EQ(send({0xD7, 0, 2, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
+    EXPECT_EQ(send({0xD7, 0, XCP_EVENTS, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(send({0xD7, 0, 0, 1}), failed(XCP_ERROR_OUT_OF_RANGE));
 }
 

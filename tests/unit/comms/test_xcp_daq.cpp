@@ -129,7 +129,7 @@ TEST_F(XcpDaq, refuses_more_than_there_is) {
         EXPECT_EQ(set_pointer(odt, entry), failed(XCP_ERROR_OUT_OF_RANGE)) << odt << " " << entry;
     }
     EXPECT_EQ(set_pointer(0, 0, 1), failed(XCP_ERROR_OUT_OF_RANGE));
-    for (const unsigned event : {2, 256, 65535}) {
+    for (const unsigned event : {XCP_EVENTS, 256u, 65535u}) {
         EXPECT_EQ(set_mode(0, event, 1), failed(XCP_ERROR_OUT_OF_RANGE));
     }
     EXPECT_EQ(set_mode(0, 0, 0), failed(XCP_ERROR_OUT_OF_RANGE)) << "the prescaler is at least 1";

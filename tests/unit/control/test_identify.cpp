@@ -29,11 +29,17 @@ struct Identify : testing::Test {
 
     void command(identify_kind_t kind, uint16_t level_q12 = 4095, uint16_t time_ms = 0, uint16_t begin = 0,
                  uint16_t width = 0) {
-        identify.command = {kind, static_cast<uint8_t>(phase), static_cast<uint8_t>(identify.command.number + 1),
-                            level_q12, time_ms, begin, width};
+        identify.command = {kind,
+                            static_cast<uint8_t>(phase),
+                            static_cast<uint8_t>(identify.command.number + 1),
+                            level_q12,
+                            time_ms,
+                            begin,
+                            width};
     }
     void step() {
-        current_A = std::max(0.0, current_A + applied * rise_A * (1.0 + 2.0 / (1.0 + std::exp((saturated_A - current_A) / 3.0))));
+        current_A = std::max(0.0, current_A + applied * rise_A *
+                                                  (1.0 + 2.0 / (1.0 + std::exp((saturated_A - current_A) / 3.0))));
         peak_A = std::max(peak_A, current_A);
         applied = next;
         angle += speed;
@@ -137,8 +143,8 @@ TEST_F(Identify, a_window_is_awaited_in_both_directions_and_over_the_end_of_the_
         for (const uint32_t begin : {0x1000u, 0x8000u, 0xFFF0u}) {
             identify_begin(&identify, 0, true);
             current_A = 0.0;
-            angle = (begin << 16) - static_cast<uint32_t>(direction) * (300u << 16) +
-                    (direction < 0 ? 0x20u << 16 : 0u);
+            angle =
+                (begin << 16) - static_cast<uint32_t>(direction) * (300u << 16) + (direction < 0 ? 0x20u << 16 : 0u);
             speed = static_cast<uint32_t>(direction * (1 << 17));
             command(IDENTIFY_KIND_PULSE, 4095, 100, static_cast<uint16_t>(begin), 0x20);
             unsigned periods = 0;

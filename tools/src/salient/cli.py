@@ -290,7 +290,7 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     identify.add_argument("--true-machine", type=_option_type("true_machine"), metavar="NAME|FILE",
                           help="instead of --can: simulates a drive of the name plate with this motor")
     identify.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                          help="with --true-machine: variable of the test bench, as encoder_offset_deg; may be repeated")
+                          help="with --true-machine: variable of the test bench; may be repeated")
     for name, kind in (("encoder_bits", "encoder_bits"), ("seed", "seed")):
         identify.add_argument(f"--{name.replace('_', '-')}", dest=name, type=_option_type(kind), metavar="N",
                               help=f"with --true-machine: {OPTIONS[name].help} (default as the name plate)")

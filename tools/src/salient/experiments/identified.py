@@ -80,7 +80,7 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
         bench = Bench(config, f"unix:{socket}/bus")
         try:
             settings = {"current_noise_A": condition.get("noise_lsb", 0.0) * lsb_A,
-                        "current_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
+                        "current_sensor_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
                         "encoder_eccentricity_deg": condition.get("encoder_eccentricity_deg", 0.0),
                         "load_torque_Nm": condition.get("load", 0.0) * data.torque_rated_Nm}
             for name, value in settings.items():
@@ -162,7 +162,7 @@ def main(arguments: Sequence[str]) -> int:
                     for label, of in (("measured", str(file)), ("true", str(path))):
                         entry |= {f"{key}_{label}": value for key, value in
                                   driven(of, path, options.out / f"{path.stem}_{label}").items()}
-            except Exception as error:  # noqa: BLE001 - every failure is a result of this experiment
+            except Exception as error:
                 failed += 1
                 entry["failed"] = f"{type(error).__name__}: {error}"
             found.append(entry)

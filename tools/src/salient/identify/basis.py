@@ -1,4 +1,4 @@
-"""Flux linkage of a phase as psi = i s(theta, i) with a spline s that is even about the aligned and the unaligned angle:
+"""Flux linkage of a phase as psi = i s(theta, i) with a spline s that is even about aligned and unaligned angle:
 cubic B-splines in both directions. psi is 0 at no current, and periodic, by construction."""
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ import math
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sparse
+from scipy import sparse
 from scipy.interpolate import BSpline
 
 _DEGREE = 3

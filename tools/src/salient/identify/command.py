@@ -24,8 +24,8 @@ TELEMETRY_PERIOD_MS = 20
 
 
 def run(options: argparse.Namespace) -> int:
-    """Identifies; returns the exit code: 0, also with warnings. UsageError, MachineError: a mistake in the options or the
-    name plate; IdentifyError: the drive does not take the experiments, or they do not determine the machine; then
+    """Identifies; returns the exit code: 0, also with warnings. UsageError, MachineError: a mistake in the options or
+    the name plate; IdentifyError: the drive does not take the experiments, or they do not determine the machine; then
     nothing is written."""
     plate = machine_path(options.machine)
     machine = load_machine(plate)

@@ -2,12 +2,12 @@
 
     integral of s Vdc dt = psi(theta - delta, i) + R integral of i dt + 2 V t
 
-s is +1 with both switches on, 0 freewheeling, -1 with both off. psi is linear in the coefficients of its spline, and so
-are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newton) add what is not: the angle of each phase,
-the delay of the current sensors, their offsets, the eccentricity of the encoder.
+s is +1 with both switches on, 0 freewheeling, -1 with both off. psi is linear in the coefficients of its spline, and
+so are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newton) add what is not: the angle of each
+phase, the delay of the current sensors, their offsets, the eccentricity of the encoder.
 
-Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and what
-the drop of a switch differs from that of a diode.
+Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and
+what the drop of a switch differs from that of a diode.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as linalg
-import scipy.sparse as sparse
+from scipy import linalg, sparse
 
 from salient.identify.basis import FluxBasis
 from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError

@@ -126,12 +126,13 @@ class Link:
 
     def _decoded(self, words: np.ndarray) -> np.ndarray:
         out = np.zeros(len(words), RECORD)
-        steps = np.diff(words["time"].astype(np.int64), prepend=self._time_us & 0xFFFF) % 65536
+        times_us = np.concatenate([[self._time_us & 0xFFFF], words["time"].astype(np.int64)])
+        steps = np.mod(np.diff(times_us), 65536)
         out["time_us"] = self._time_us + np.cumsum(steps)
         second = words["second"]
         angle = (second >> 12).astype(np.int64)
         full = 1 << _ANGLE_BITS
-        turned = (np.diff(angle, prepend=self._turn % full) + full // 2) % full - full // 2
+        turned = np.mod(np.diff(np.concatenate([[self._turn % full], angle])) + full // 2, full) - full // 2
         turn = self._turn + np.cumsum(turned)
         out["turn"] = turn / full + self._middle_rev
         out["phase"] = second >> 9 & 7
@@ -190,6 +191,7 @@ def linked(session: Session) -> Iterator[Link]:
         drive.begin_experiment(Experiment("rest"))
         deadline_s = session.time_s + 1.0
         while drive.state != "run":
+            link.check()
             if session.time_s > deadline_s or drive.state == "fault":
                 raise IdentifyError(f"the drive does not begin: state {drive.state}, fault {drive.fault}"
                                     f"{'; ' + drive.hindrance if drive.hindrance else ''}")

@@ -1,4 +1,4 @@
-"""The page of an identification: maps with bands, residuals, the course of the experiments, a verdict on each quantity."""
+"""The page of an identification: maps with bands, residuals, course of the experiments, a verdict on each quantity."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def _residuals(result: Result) -> Plot:
     right.set(xlabel="current, A")
     for axes in (left, right):
         axes.grid(alpha=0.3)
-    return Plot("Residuals", "What the fit leaves of the integral of the voltage, of every sample. A pattern over the angle "
-                "is a corner that the map cannot follow; one over the current an effect that the model does not have.",
+    return Plot("Residuals", "What the fit leaves of the integral of the voltage, of every sample. A pattern over the "
+                "angle is a corner that the map cannot follow; one over the current an effect that the model lacks.",
                 _png(figure))
 
 

@@ -36,8 +36,8 @@ _NEAR_LIMIT = 0.9
 _MODEL_PART = 0.0025
 """What inertia and friction are wrong by without any noise, by the judge (salient.experiments.compare.identified)."""
 NOT_OBSERVABLE = (
-    ("gain of the current sensors", "a common error scales flux linkage and torque down, resistance down, inertia up: the pulses "
-     "would be the same; by a meter in series"),
+    ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
+     "pulses would be the same; by a meter in series"),
     ("gain of the DC-link voltage", "scales flux linkage and resistance alike; by a voltmeter"),
     ("drop of a switch less that of a diode", "acts as a change of the DC-link voltage"),
     ("mutual coupling of the phases", "one phase alone carries current in each pulse"),
@@ -56,6 +56,14 @@ class Quantity:
     value: float
     half_width: float
     verdict: str
+
+
+@dataclass(frozen=True)
+class _Maps:
+    flux_Wb: np.ndarray
+    flux_deviation: np.ndarray
+    torque_Nm: np.ndarray
+    torque_deviation: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,9 +103,10 @@ def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = S
     flux_deviation = np.std([other.flux_Wb(angle, current) for other in others], axis=0)
     torque_deviation = np.std([other.torque_Nm(angle, current) for other in others], axis=0)
     quiet = log[log["time_us"] < log["time_us"][0] + 20_000]
+    maps = _Maps(flux, flux_deviation, torque, torque_deviation)
     return Result(found, fit, shaft, rows, log, limit_A, float(np.median(quiet["dc_link_V"])), angle, current, flux,
                   flux_deviation, torque, torque_deviation, float(np.abs(flux - raw).max()),
-                  _quantities(found, fit, others, shaft, flux, flux_deviation, torque, torque_deviation),
+                  _quantities(found, fit, others, shaft, maps),
                   _warnings(found, fit))
 
 
@@ -122,8 +131,10 @@ def _verdict(half_width: float, bound: float) -> str:
     return "determined" if half_width <= bound else "uncertain"
 
 
-def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, flux: np.ndarray,
-                flux_deviation: np.ndarray, torque: np.ndarray, torque_deviation: np.ndarray) -> list[Quantity]:
+def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, maps: _Maps) -> list[Quantity]:
+    flux, torque = maps.flux_Wb, maps.torque_Nm
+    flux_deviation, torque_deviation = maps.flux_deviation, maps.torque_deviation
+
     def half(values: Any) -> float:
         return _INTERVAL * float(np.std(list(values)))
 
@@ -167,13 +178,13 @@ def _warnings(found: Findings, fit: Fit) -> list[str]:
         reverse = order == [-k % len(order) for k in range(len(order))]
         names = ", ".join(f"{'abcdef'[phase]} is {'abcdef'[found.order[phase]]}" for phase in found.phases
                           if found.order[phase] != found.phases.index(phase))
-        lines.append(("the encoder counts against the order of the phases: exchange two phases, or its direction"
-                      if reverse else f"the phases are wired in another order: {names}"))
+        lines.append("the encoder counts against the order of the phases: exchange two phases, or its direction"
+                     if reverse else f"the phases are wired in another order: {names}")
     aligned = math.remainder(math.degrees(2.0 * math.pi * found.position[found.phases[0]] + fit.delta_rad[0]),
                              360.0 / found.rotor_poles)
     if abs(aligned) > 0.5:
-        lines.append(f"the encoder reads {aligned:+.3f} degrees where phase a is aligned: set its zero there; the drive has "
-                     "no parameter for it")
+        lines.append(f"the encoder reads {aligned:+.3f} degrees where phase a is aligned: set its zero there; the "
+                     "drive has no parameter for it")
     return lines
 
 
@@ -183,8 +194,9 @@ def write_machine(result: Result, plate: Path, path: Path) -> Machine:
     """Writes the machine file with its map beside it: motor by the result, board and ratings by the name plate's file.
     Returns it as the loader reads it. IdentifyError: the loader refuses it, by its reason."""
     machine = load_machine(plate)
-    text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine,
-                 scaling_of(plate, machine).data.adc_current_A, scaling_of(plate, machine).data.adc_voltage_V, path)
+    data = scaling_of(plate, machine).data
+    board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
+    text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine, board, path)
     table = path.with_suffix(".csv")
     lines = ["# measured by the drive: tools/salient identify", "angle_deg,current_A,flux_linkage_Wb"]
     angle, current, flux = _to_limit(result)
@@ -224,7 +236,7 @@ def _to_limit(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             np.hstack([flux, more[:, None]]))
 
 
-def _text(result: Result, plate: Mapping[str, Any], machine: Machine, adc_A: float, adc_V: float, path: Path) -> str:
+def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:
     fit, shaft = result.fit, result.shaft
     converter = dict(plate.get("converter", {}))
     of_devices = sum(machine.converter.get(name, 0.0) for name in ("switch_resistance_ohm", "diode_resistance_ohm"))
@@ -232,7 +244,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, adc_A: flo
         converter |= {"switch_drop_V": round(fit.drop_V, 4), "diode_drop_V": round(fit.drop_V, 4)}
     converter["supply_voltage_V"] = round(result.supply_V, 1)
     drive = {name: value for name, value in plate.get("drive", {}).items() if name != "parameters"}
-    drive |= {"adc_current_A": adc_A, "adc_voltage_V": adc_V, "current_peak_A": float(f"{_peak_A(result):.6g}")}
+    drive |= {**board, "current_peak_A": float(f"{_peak_A(result):.6g}")}
     resistance = fit.resistance_ohm - of_devices
     if resistance <= 0.0:
         raise IdentifyError(f"resistance {fit.resistance_ohm:.4g} ohm: less than that of the devices, {of_devices:.4g}")
@@ -248,8 +260,8 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, adc_A: flo
     }
     if plate.get("drive", {}).get("parameters"):
         tables["drive.parameters"] = plate["drive"]["parameters"]
-    return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.", path.stem,
-                        tables)
+    return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
+                        path.stem, tables)
 
 
 def machine_text(about: str, name: str, tables: Mapping[str, Mapping[str, Any]]) -> str:

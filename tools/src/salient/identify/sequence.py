@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from salient.bench.drive import Experiment
-from salient.identify.link import CHARGES, FREEWHEELS, RESTS, IdentifyError, Link
+from salient.identify.link import CHARGES, RESTS, IdentifyError, Link
 
 PULSE_LEVEL, HOLD_LEVEL, PROBE_LEVEL = 4095 / 4096, 0.3, 0.1
 _STILL = 0.003 / (2.0 * math.pi)
@@ -104,8 +104,8 @@ class Sequence:
     def align(self) -> None:
         """Positions and order of the phases; pulses of long freewheeling at each. IdentifyError: they contradict the
         number of poles."""
-        self.tell(f"hold: each phase pulls the rotor with {HOLD_LEVEL:.0%} of the limit and is damped: order, direction,"
-                  " angles")
+        self.tell(f"hold: each phase pulls the rotor with {HOLD_LEVEL:.0%} of the limit and is damped: order, "
+                  "direction, angles")
         phases = [*self.found.phases, self.found.phases[0]]
         places: list[float] = []
         for number, phase in enumerate(phases):
@@ -137,7 +137,7 @@ class Sequence:
     def _settle(self, phase: int) -> tuple[float, float]:
         """Where a phase holds the rotor, and how far that was, rev."""
         turns = self._hold(phase, _HOLD_S, None)
-        while _HOLD_MAX_S > len(turns) * 1e-3 and np.ptp(turns) >= _STILL and len(turning_points(turns)) < 3:
+        while len(turns) * 1e-3 < _HOLD_MAX_S and np.ptp(turns) >= _STILL and len(turning_points(turns)) < 3:
             turns = np.concatenate([turns, self._hold(phase, _HOLD_S, None)])
         moved, span_s = float(np.ptp(turns)), max(len(turns) * 1e-3, 0.1)
         quiet = _QUIET / self.found.rotor_poles
@@ -261,7 +261,7 @@ class Sequence:
             direction = 1 if speed >= 0.0 else -1
             at = turn + speed * _LATENCY_S
             phase = max(found.phases, key=lambda each: -direction * math.sin(
-                2.0 * math.pi * found.electrical(each, at)))  # noqa: B023 - called here
+                2.0 * math.pi * found.electrical(each, at)))
             log = self._pulse(Experiment("pulse", phase, PULSE_LEVEL))
         link.rest(_COAST_S)
         link.check()
@@ -272,7 +272,8 @@ def turning_points(turns: np.ndarray) -> np.ndarray:
     if len(turns) < 16:
         return np.zeros(0)
     smooth = np.convolve(turns[::max(1, len(turns) // 600)], np.ones(7) / 7.0, "valid")
-    span, points = float(np.ptp(smooth)), []
+    span = float(np.ptp(smooth))
+    points: list[float] = []
     for before, here, after in zip(smooth[:-2], smooth[1:-1], smooth[2:], strict=True):
         if (here - before) * (after - here) <= 0.0 and (not points or abs(here - points[-1]) > 0.1 * span):
             points.append(here)

@@ -2,7 +2,7 @@
 
 In the weak form, with test functions phi of short windows, nothing is differentiated but phi:
 
-    integral of phi'' theta = (1/J) integral of phi T - (B/J) integral of phi w - (C/J) integral of phi sign(w) - L/J ...
+    int phi'' theta = (1/J) int phi T - (B/J) int phi w - (C/J) int phi sign(w) - (L/J) int phi
 
 Window by window one equation of 1/J, B/J, the Coulomb friction's C/J and a constant load's L/J. The two last ones are
 left out while they are within their uncertainty. Uncertainty by resampling runs of windows.
