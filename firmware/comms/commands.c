@@ -74,7 +74,36 @@ static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) 
     return reject(counter);
 }
 
-static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH, "both commands have one check of their length");
+static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH &&
+                  DRIVE_COMMAND_LENGTH == DRIVE_IDENTIFY_WINDOW_LENGTH &&
+                  DRIVE_POSITION_COMMAND_LENGTH == DRIVE_IDENTIFY_COMMAND_LENGTH,
+              "one check of their length");
+
+/* Writes an experiment, of which the window comes before the rest. As unpack. */
+static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *identify, command_t *command) {
+    if (frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID) {
+        struct drive_identify_window_t window;
+        drive_identify_window_unpack(&window, frame->data, frame->length);
+        identify->angle_q16 = window.angle;
+        identify->width_q16 = window.width;
+        return true;
+    }
+    struct drive_identify_command_t message;
+    drive_identify_command_unpack(&message, frame->data, frame->length);
+    if (!drive_identify_command_request_is_in_range(message.request) ||
+        !drive_identify_command_kind_is_in_range(message.kind) || message.phase >= machine_tables.phases) {
+        return false;
+    }
+    command->request = message.request == COMMAND_RUN ? COMMAND_IDENTIFY : (command_request_t)message.request;
+    command->mode = DRIVE_MODE_SPEED;
+    command->speed_reference_q22 = 0;
+    identify->kind = (identify_kind_t)message.kind;
+    identify->phase = message.phase;
+    identify->number = message.number;
+    identify->level_q12 = message.level;
+    identify->time_ms = message.time_ms;
+    return true;
+}
 
 /* As unpack; the order and the position in its range are valid in every bit. */
 static bool unpack_position(const hal_can_frame_t *frame, command_t *command) {
@@ -127,7 +156,7 @@ static bool unpack(const hal_can_frame_t *frame, command_t *command) {
 /* Writes the command in effect: the last valid one, and off instead of run while not armed. */
 static void publish(commands_t *commands, command_t *command) {
     *command = commands->requested;
-    if (command->request != COMMAND_RUN) {
+    if (!command_needs_arming(command->request)) {
         return;
     }
     if (commands->arming.armed) {
@@ -168,11 +197,19 @@ static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_
     }
 }
 
+/* In a run there is no fault to clear, and a run of one kind does not become one of the other. */
+static bool may_follow(const commands_t *commands, command_request_t request) {
+    const command_request_t before = commands->requested.request;
+    const bool changes_kind = command_needs_arming(request) && command_needs_arming(before) && request != before;
+    return commands->state != DRIVE_STATE_RUN || (request != COMMAND_CLEAR_FAULT && !changes_kind);
+}
+
 static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
-    const bool position = frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID;
-    if (frame->length != (position ? DRIVE_POSITION_COMMAND_LENGTH : DRIVE_COMMAND_LENGTH)) {
+    const bool longer = frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID ||
+                        frame->identifier == DRIVE_IDENTIFY_COMMAND_FRAME_ID;
+    if (frame->length != (longer ? DRIVE_POSITION_COMMAND_LENGTH : DRIVE_COMMAND_LENGTH)) {
         return reject_command(commands, &counters->wrong_length);
     }
     commands_frame_t rejection;
@@ -181,16 +218,20 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     }
     commands->last_received_us = time_us;
     command_t requested = commands->requested;
-    if (!unpack(frame, &requested) ||
-        (requested.request == COMMAND_CLEAR_FAULT && commands->state == DRIVE_STATE_RUN)) { /* nothing to clear */
+    identify_command_t experiment = commands->identify;
+    if (!(identify || frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID
+              ? unpack_identify(frame, &experiment, &requested)
+              : unpack(frame, &requested)) ||
+        !may_follow(commands, requested.request)) {
         return reject_command(commands, &counters->out_of_range);
     }
     commands->requested = requested;
+    commands->identify = experiment;
     counter_add(&counters->accepted, 1);
     commands->errors = (uint16_t)(commands->errors - (commands->errors > 0));
     commands->requested.time_us = time_us;
     const bool stopping = commands->requested.request == COMMAND_STOP && commands->state == DRIVE_STATE_RUN;
-    if (commands->used && commands->requested.request != COMMAND_RUN && !stopping) {
+    if (commands->used && !command_needs_arming(commands->requested.request) && !stopping) {
         commands_disarm(commands);
     }
     if (commands->failed && commands->state == DRIVE_STATE_RUN) { /* it would end the run before the fault does */
@@ -273,6 +314,12 @@ commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_ca
     }
     if (frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID) {
         return receive_command(commands, DRIVE_POSITION_COMMAND_E2E_DATA_ID, frame, time_us, command);
+    }
+    if (frame->identifier == DRIVE_IDENTIFY_COMMAND_FRAME_ID) {
+        return receive_command(commands, DRIVE_IDENTIFY_COMMAND_E2E_DATA_ID, frame, time_us, command);
+    }
+    if (frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID) {
+        return receive_command(commands, DRIVE_IDENTIFY_WINDOW_E2E_DATA_ID, frame, time_us, command);
     }
     if (frame->identifier == DRIVE_ARM_FRAME_ID) {
         return receive_arming(commands, hal, frame, time_us, timeout_us, command);

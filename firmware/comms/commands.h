@@ -30,6 +30,7 @@
 
 #include "comms/arming.h"
 #include "comms/e2e.h"
+#include "control/identify.h"
 #include "hal_can.h"
 #include "interrupts/command.h"
 
@@ -56,7 +57,7 @@ typedef struct {
 } commands_counters_t;
 
 typedef struct {
-    e2e_receiver_t receiver;     /* of DRIVE_COMMAND, DRIVE_TORQUE_COMMAND, DRIVE_POSITION_COMMAND */
+    e2e_receiver_t receiver;     /* of all commands to run */
     uint16_t data_id_offset;     /* of the node, added to the data IDs of drive.dbc; set by the caller after
                                     commands_init */
     uint32_t last_received_us;   /* time of the last frame that it accepted */
@@ -71,6 +72,7 @@ typedef struct {
     uint16_t errors;     /* count of invalid command frames while armed, above */
     drive_state_t state; /* of the last commands_supervise */
     command_t requested; /* last valid command; the published one has off instead of run while not armed */
+    identify_command_t identify; /* experiment of COMMAND_IDENTIFY */
     commands_counters_t counters;
 } commands_t;
 

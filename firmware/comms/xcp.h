@@ -21,7 +21,7 @@
  * A write of a parameter is a set of one (parameter_set.h): staged, checked as any other, and applied or refused. It
  * is refused while another set is staged. In a run tunable parameters only. SET_REQUEST STORE_CAL stores.
  *
- * Measuring: one DAQ list, of a choice of three events, of at most SAMPLER_CHANNELS_MAX entries within single words.
+ * Measuring: one DAQ list, of a choice of four events, of at most SAMPLER_CHANNELS_MAX entries within single words.
  * Records that the bus does not take are lost, and counted (drive_t.sampler.lost); the time in the first frame of a
  * record shows them. DAQ frames have the lowest priority of the drive but for two, and only one of them is in a
  * mailbox.
@@ -40,7 +40,7 @@
 
 #define XCP_SILENT_US 10000000u
 #define XCP_ODTS_MAX SAMPLER_CHANNELS_MAX
-#define XCP_EVENTS 3u /* of sampler_event_t */
+#define XCP_EVENTS 4u /* of sampler_event_t */
 #define XCP_TEXT_BYTES 32u
 
 #define XCP_AREA 0xF0000000u /* bits of an address that select the area */

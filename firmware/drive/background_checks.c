@@ -17,7 +17,7 @@ COLD static void read_stall_input(const control_state_t *control, stall_input_t 
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
     *input = (stall_input_t){
         .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED &&
-                      !position_seeks_stop(&control->position),
+                      !position_seeks_stop(&control->position) && !control->state_machine.identifies,
         .speed_reference_q22 = speed->speed_reference_q22,
         .speed_q22 = control->observer.speed_q22,
         .torque_reference_q24 = control->torque_reference_q24,
@@ -39,7 +39,7 @@ COLD static bool read_sample(const control_state_t *control, const control_param
     flux_sample_t *input = &sample->flux;
     for (unsigned attempt = 0; attempt < UNMASKED_READ_ATTEMPTS; attempt++) {
         input->periods = unmasked_read_begin(request);
-        input->run = control->state_machine.state == DRIVE_STATE_RUN;
+        input->run = control->state_machine.state == DRIVE_STATE_RUN && !control->state_machine.identifies;
         input->late_interrupts = control->protection.late_interrupts;
         input->electrical = measured->commutation.electrical;
         input->period_flux_q29 =
@@ -210,6 +210,9 @@ COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
  * changed. The last one before a bus-off is not taken, and lets the one before age. */
 COLD static bool is_commanded(const drive_t *drive) {
     const command_request_t received = drive->comms.command.request;
+    if (drive->command.request == COMMAND_IDENTIFY) {
+        return received == COMMAND_IDENTIFY || drive->comms.bus.run_inhibited;
+    }
     return drive->command.request != COMMAND_RUN || received == COMMAND_RUN || received == COMMAND_STOP ||
            drive->comms.bus.run_inhibited;
 }
@@ -268,6 +271,10 @@ COLD static void check(drive_t *drive, hal_t *hal, uint32_t time_us) {
         return;
     }
     uint32_t failed = follow_lost_phase(drive, check_flux(drive, hal, &sample.flux));
+    if (drive->control.state_machine.identifies) { /* with tables that need not be the machine's */
+        flux_monitor_forget(&drive->flux);
+        failed = 0;
+    }
     if (stall_monitor_failed(&drive->stall, &sample.stall, time_us)) {
         failed |= (uint32_t)FAULT_BIT(FAULT_STALL);
     }

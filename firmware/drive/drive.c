@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "comms/node.h"
+#include "control/modulator.h"
 #include "control/position/position_configure.h"
 #include "drive/background_checks.h"
 #include "drive/telemetry_collect.h"
@@ -23,7 +24,7 @@
 /* True while the drive does not run and cannot begin to: a run starts with a command that only the background
  * publishes. */
 static bool may_configure(const drive_t *drive) {
-    return drive->control.state_machine.state != DRIVE_STATE_RUN && drive->command.request != COMMAND_RUN;
+    return drive->control.state_machine.state != DRIVE_STATE_RUN && !command_needs_arming(drive->command.request);
 }
 
 /* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
@@ -102,6 +103,38 @@ static inline fault_trace_values_t trace_values(const drive_t *drive, const hal_
     };
 }
 
+/* A period of an experiment; false, and nothing is done, outside of that mode. */
+NOINLINE static bool identify(drive_t *drive, hal_t *hal, const hal_adc_sample_t *adc, uint32_t time_us) {
+    control_state_t *control = &drive->control;
+    if (!control->state_machine.identifies) {
+        drive->identify.begun = false;
+        return false;
+    }
+    const control_parameters_t *parameters = &drive->control_parameters;
+    const identify_parameters_t identify_parameters = {
+        .limit_q9 = parameters->duty.current_limit_q9,
+        .periods_per_ms = parameters->initialise_ticks,
+        .phases = machine_tables.phases,
+    };
+    const identify_sample_t sample = {
+        .current_q9 = control->measurement.current_q9,
+        .dc_link_q6 = control->measurement.dc_link_voltage_q6,
+        .angle = control->measurement.encoder_angle,
+    };
+    if (!drive->identify.begun) {
+        identify_begin(&drive->identify, sample.angle, parameters->torque_law == TORQUE_LAW_PREDICTIVE);
+    }
+    identify_step(&identify_parameters, &drive->identify, &sample, control->duty_q15);
+    modulate(control->duty_q15, machine_tables.phases, parameters->period_ticks, false, &drive->compare);
+    hal_pwm_write(hal, &drive->compare);
+    const fault_trace_values_t values = trace_values(drive, adc);
+    fault_trace_run(&drive->trace, &values);
+    if (drive->identify.records && drive->sampler.event == SAMPLER_EVENT_IDENTIFY) {
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
+    }
+    return true;
+}
+
 void drive_control_interrupt(drive_t *drive, hal_t *hal) {
     hal_adc_sample_t adc;
     control_sample_t sample = {
@@ -118,7 +151,7 @@ void drive_control_interrupt(drive_t *drive, hal_t *hal) {
         hal_pwm_write(hal, &drive->compare);
         const fault_trace_values_t values = trace_values(drive, &adc);
         fault_trace_run(&drive->trace, &values);
-    } else {
+    } else if (!identify(drive, hal, &adc, sample.time_us)) {
         const fault_trace_values_t values = trace_values(drive, &adc);
         hal_pwm_open_all(hal);
         if (sample.break_causes != 0) {
@@ -170,7 +203,7 @@ void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
 /* Withdraws a command to run that must not start a run later: without being armed. Silence disarms, so that none
  * becomes so old that the clock wraps and its age appears small again. */
 static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
-    if (drive->command.request == COMMAND_RUN && !drive->comms.commands.arming.armed &&
+    if (command_needs_arming(drive->command.request) && !drive->comms.commands.arming.armed &&
         drive->control.state_machine.state != DRIVE_STATE_RUN) {
         hal_critical_enter(hal);
         drive->command.request = COMMAND_OFF;
@@ -184,7 +217,7 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
     const command_t *command = &drive->comms.command;
     bus_monitor_t *bus = &drive->comms.bus;
     /* The request as it was sent: bus-off disarms, and a request to run is published as off. */
-    bus->run_inhibited = bus->run_inhibited && drive->comms.commands.requested.request == COMMAND_RUN;
+    bus->run_inhibited = bus->run_inhibited && command_needs_arming(drive->comms.commands.requested.request);
     if (!bus->run_inhibited) {
         position_command_t position = drive->control.position_command;
         if (command->mode == DRIVE_MODE_POSITION) {
@@ -196,6 +229,7 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
         hal_critical_enter(hal);
         drive->command = *command;
         drive->control.position_command = position;
+        drive->identify.command = drive->comms.commands.identify;
         hal_critical_leave(hal);
         drive->ramping = false;
     }
@@ -229,13 +263,25 @@ COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
     return drive->ramp_of_speed && beyond_q22 > fixed_abs(reference_q22) / 16;
 }
 
+COLD static void end_experiments(drive_t *drive, hal_t *hal) {
+    hal_critical_enter(hal);
+    drive->command.request = COMMAND_OFF;
+    hal_critical_leave(hal);
+}
+
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
  * with the time of the last valid command, so that the interrupts need nothing for it. */
 static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const uint32_t timeout_us = (uint32_t)drive->parameters.values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u;
     const uint32_t age_us = time_us - drive->command.time_us;
-    if (drive->control.state_machine.state != DRIVE_STATE_RUN || age_us <= timeout_us ||
-        (drive->ramping && time_us - drive->ramp_us < DRIVE_RAMP_STEP_US)) {
+    if (drive->control.state_machine.state != DRIVE_STATE_RUN || age_us <= timeout_us) {
+        return;
+    }
+    if (drive->command.request == COMMAND_IDENTIFY) { /* experiments have no torque to ramp */
+        end_experiments(drive, hal);
+        return;
+    }
+    if (drive->ramping && time_us - drive->ramp_us < DRIVE_RAMP_STEP_US) {
         return;
     }
     if (!drive->ramping) {
@@ -323,6 +369,9 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
     }
     if (commanded) {
         take_command(drive, hal);
+    }
+    if (drive->identify.state == IDENTIFY_ENDED && drive->command.request == COMMAND_IDENTIFY) {
+        end_experiments(drive, hal);
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     if (drive->sampler.event == SAMPLER_EVENT_BACKGROUND) {

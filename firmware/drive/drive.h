@@ -8,6 +8,7 @@
 
 #include "comms/comms.h"
 #include "control/flux_angle.h"
+#include "control/identify.h"
 #include "control/shaft_torque.h"
 #include "control/table_scale.h"
 #include "hal.h"
@@ -81,6 +82,10 @@ typedef struct {
     /* Written by the control interrupt. Last because it is large: loads and stores reach a limited offset in one
      * instruction. */
     fault_trace_t trace;
+    /* Written by the context of its event, and by the background while it has none. */
+    sampler_t sampler;
+    /* Written by the control interrupt, its member `command` by the background with the interrupts masked. */
+    identify_t identify;
 } drive_t;
 
 static_assert(sizeof(drive_t) % sizeof(uint32_t) == 0, "the sampler and XCP read words");

@@ -9,6 +9,7 @@
 #ifndef INTERRUPTS_COMMAND_H
 #define INTERRUPTS_COMMAND_H
 
+#include <stdbool.h>
 #include <stdint.h>
 
 #include "control/position/position.h"
@@ -16,6 +17,14 @@
 
 /* Time without a valid command after which a run ends in the fault command_timeout. */
 #define COMMAND_LOST_US 500000u
+
+/* Request to run experiments (control/identify.h), beside those of the bus. */
+#define COMMAND_IDENTIFY ((command_request_t)COMMAND_COUNT)
+
+/* True of the requests that a drive has to be armed for. */
+static inline bool command_needs_arming(command_request_t request) {
+    return request == COMMAND_RUN || request == COMMAND_IDENTIFY;
+}
 
 typedef struct {
     command_request_t request;

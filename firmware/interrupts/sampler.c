@@ -127,7 +127,7 @@ COLD static bool valid(const sampler_setup_t *setup, uint32_t words) {
         within = within && setup->word[i] < words;
     }
     return within && setup->channels >= 1u && setup->channels <= SAMPLER_CHANNELS_MAX &&
-           setup->event >= SAMPLER_EVENT_CONTROL && setup->event <= SAMPLER_EVENT_DEFERRED && setup->divider >= 1u &&
+           setup->event >= SAMPLER_EVENT_CONTROL && setup->event <= SAMPLER_EVENT_IDENTIFY && setup->divider >= 1u &&
            setup->condition < SAMPLER_CONDITIONS && setup->variable.left <= 31u && setup->variable.right <= 31u;
 }
 

@@ -28,7 +28,12 @@ typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
 
 /* In the deferred interrupt's results an event is the first control interrupt that finds a step complete, which the
  * next one has not begun to change. */
-typedef enum { SAMPLER_EVENT_CONTROL = 1, SAMPLER_EVENT_BACKGROUND, SAMPLER_EVENT_DEFERRED } sampler_event_t;
+typedef enum {
+    SAMPLER_EVENT_CONTROL = 1,
+    SAMPLER_EVENT_BACKGROUND,
+    SAMPLER_EVENT_DEFERRED,
+    SAMPLER_EVENT_IDENTIFY /* control periods that belong into the record of an experiment (control/identify.h) */
+} sampler_event_t;
 
 /* Bit of the events that the control interrupt has: one test for both. */
 #define SAMPLER_IN_CONTROL 1u

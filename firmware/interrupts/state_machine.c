@@ -22,6 +22,7 @@ static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     state_machine->state = DRIVE_STATE_FAULT;
     state_machine->rearmed = false;
     state_machine->clearing = false;
+    state_machine->identifies = false;
     state_machine->fault_free_ticks = 0;
     return true;
 }
@@ -49,7 +50,7 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
     const uint64_t all_but_timeout = fault_mask & ~FAULT_BIT(FAULT_COMMAND_TIMEOUT);
     const bool request_changed = request != state_machine->last_request;
     state_machine->last_request = request;
-    if (request != COMMAND_RUN) {
+    if (!command_needs_arming(request)) {
         state_machine->rearmed = true;
     }
     switch (state_machine->state) {
@@ -65,12 +66,15 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
         if (all_but_timeout != 0) {
             return latch_fault(state_machine, all_but_timeout);
         }
+        state_machine->identifies = request == COMMAND_IDENTIFY && state_machine->rearmed;
+        state_machine->state = state_machine->identifies ? DRIVE_STATE_RUN : DRIVE_STATE_READY;
         break;
     case DRIVE_STATE_RUN:
         if (fault_mask != 0) {
             return latch_fault(state_machine, fault_mask);
         }
-        state_machine->state = DRIVE_STATE_READY;
+        state_machine->identifies = state_machine->identifies && request == COMMAND_IDENTIFY;
+        state_machine->state = state_machine->identifies ? DRIVE_STATE_RUN : DRIVE_STATE_READY;
         break;
     case DRIVE_STATE_FAULT:
         state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;

@@ -9,6 +9,8 @@
  * over: a request that persists clears neither a later fault nor one whose cause disappears later. In RUN it is refused
  * (comms/commands.h): a drive that finds both has got there without a request to run, and leaves it.
  *
+ * COMMAND_IDENTIFY, from READY on, is a run without the control laws: `identifies`. Every other request ends it.
+ *
  * The states are independent of the direction of rotation. RUN passes through zero speed when the reference changes its
  * sign. A stop remains in RUN with a reference that ramps to zero, from either side, until the rotor is at standstill:
  * a four-quadrant controller brakes, with a single-quadrant one the rotor coasts. Under a load that keeps the rotor
@@ -32,6 +34,7 @@ typedef struct {
     uint32_t start_inhibit_mask;    /* in INITIALISE: failed checks of this tick; 0 in every other state */
     bool clearing;                  /* in FAULT: requested, waits for the rest of the time */
     bool rearmed;                   /* the run request has been withdrawn since the last fault */
+    bool identifies;                /* in RUN: experiments instead of the control laws */
     command_request_t last_request; /* of the previous tick */
     fault_record_t record;          /* in FAULT; fault FAULT_NONE in every other state */
 } state_machine_t;

@@ -50,7 +50,9 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
         complete_record(&state_machine->record, state, time_us);
     }
     if (before == DRIVE_STATE_RUN) {
-        end_run(parameters, state);
+        if (!state_machine->identifies) {
+            end_run(parameters, state);
+        }
     } else if (state_machine->state != before) {
         if (before == DRIVE_STATE_FAULT) {
             observe_forget_load(state); /* angle and speed of a rotor that may be turning are kept */

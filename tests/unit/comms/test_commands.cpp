@@ -9,6 +9,7 @@ extern "C" {
 #include "comms/arming.h"
 #include "comms/commands.h"
 #include "comms/counter.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "hal_random.h"
 #include "storage/parameters.h"
@@ -94,6 +95,61 @@ TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
     }
 }
 
+TEST_F(Commands, an_experiment_needs_arming_and_has_its_window) {
+    ASSERT_EQ(receive(frames::identify_window(1, 0x1234, 0x56)), COMMANDS_COMMAND);
+    ASSERT_EQ(receive(frames::identify_command(2, COMMAND_RUN, IDENTIFY_KIND_PULSE, 2, 9)), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+    EXPECT_EQ(commands.counters.run_unarmed, 1);
+    arm(3, 10000);
+    ASSERT_EQ(take(frames::identify_command(4, COMMAND_RUN, IDENTIFY_KIND_PULSE, 2, 9), DRIVE_STATE_READY, 11000),
+              COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_IDENTIFY);
+    EXPECT_EQ(command.time_us, 11000u);
+    EXPECT_EQ(commands.identify.kind, IDENTIFY_KIND_PULSE);
+    EXPECT_EQ(commands.identify.phase, 2);
+    EXPECT_EQ(commands.identify.number, 9);
+    EXPECT_EQ(commands.identify.level_q12, 1234);
+    EXPECT_EQ(commands.identify.time_ms, 56);
+    EXPECT_EQ(commands.identify.angle_q16, 0x1234);
+    EXPECT_EQ(commands.identify.width_q16, 0x56);
+    take(frames::identify_command(5, COMMAND_OFF, IDENTIFY_KIND_REST, 0), DRIVE_STATE_RUN, 12000);
+    EXPECT_EQ(command.request, COMMAND_OFF);
+    EXPECT_FALSE(commands.arming.armed);
+}
+
+TEST_F(Commands, an_experiment_out_of_range_changes_nothing) {
+    receive(frames::identify_command(1, COMMAND_OFF, IDENTIFY_KIND_HOLD, 1));
+    const identify_command_t before = commands.identify;
+    expect_rejected(frames::identify_command(2, COMMAND_OFF, IDENTIFY_KIND_FREEWHEEL + 1, 1),
+                    &commands.counters.out_of_range);
+    expect_rejected(frames::identify_command(3, COMMAND_OFF, IDENTIFY_KIND_PULSE, machine_tables.phases),
+                    &commands.counters.out_of_range);
+    hal_can_frame_t shorter = frames::identify_command(4, COMMAND_OFF, IDENTIFY_KIND_PULSE, 1);
+    shorter.length = DRIVE_COMMAND_LENGTH;
+    expect_rejected(shorter, &commands.counters.wrong_length);
+    hal_can_frame_t longer = command_frame(4);
+    longer.length = DRIVE_IDENTIFY_COMMAND_LENGTH;
+    expect_rejected(longer, &commands.counters.wrong_length);
+    EXPECT_EQ(std::memcmp(&before, &commands.identify, sizeof before), 0);
+}
+
+TEST_F(Commands, a_run_does_not_become_one_of_experiments_nor_the_other_way_round) {
+    arm(3, 10000);
+    take(command_frame(4), DRIVE_STATE_READY, 11000);
+    supervise(DRIVE_STATE_RUN, 12000);
+    expect_rejected(frames::identify_command(5, COMMAND_RUN, IDENTIFY_KIND_PULSE, 0), &commands.counters.out_of_range,
+                    12000);
+    EXPECT_EQ(command.request, COMMAND_RUN);
+    take(command_frame(6, COMMAND_OFF), DRIVE_STATE_RUN, 13000);
+    supervise(DRIVE_STATE_READY, 14000);
+    arm(7, 30000);
+    take(frames::identify_command(8, COMMAND_RUN, IDENTIFY_KIND_PULSE, 0), DRIVE_STATE_READY, 31000);
+    supervise(DRIVE_STATE_RUN, 32000);
+    expect_rejected(command_frame(9), &commands.counters.out_of_range, 32000);
+    expect_rejected(frames::torque_command(10, COMMAND_RUN, 0), &commands.counters.out_of_range, 32000);
+    EXPECT_EQ(command.request, COMMAND_IDENTIFY);
+}
+
 TEST_F(Commands, the_message_of_the_last_command_is_the_mode) {
     ASSERT_EQ(receive(command_frame(7)), COMMANDS_COMMAND);
     EXPECT_EQ(command.mode, DRIVE_MODE_SPEED);
@@ -159,7 +215,8 @@ TEST_F(Commands, every_unknown_standard_identifier_is_rejected) {
         frame.identifier = identifier;
         frame.length = 8;
         if (identifier != DRIVE_COMMAND_FRAME_ID && identifier != DRIVE_TORQUE_COMMAND_FRAME_ID &&
-            identifier != DRIVE_POSITION_COMMAND_FRAME_ID && identifier != DRIVE_ARM_FRAME_ID &&
+            identifier != DRIVE_POSITION_COMMAND_FRAME_ID && identifier != DRIVE_IDENTIFY_COMMAND_FRAME_ID &&
+            identifier != DRIVE_IDENTIFY_WINDOW_FRAME_ID && identifier != DRIVE_ARM_FRAME_ID &&
             identifier != DRIVE_PARAMETER_WRITE_FRAME_ID && identifier != DRIVE_PARAMETER_SET_CONTROL_FRAME_ID &&
             identifier != DRIVE_PARAMETER_REQUEST_FRAME_ID && identifier != DRIVE_XCP_COMMAND_FRAME_ID) {
             expect_rejected(frame, &commands.counters.unknown_frame);

@@ -134,7 +134,7 @@ TEST_F(Xcp, identifies_program_and_events_by_texts) {
     for (const unsigned type : {2, 3, 4, 6, 128, 255}) {
         EXPECT_EQ(send({0xFA, uint8_t(type)}), (bytes_t{0xFF, 0, 0, 0, 0, 0, 0, 0})) << "there is none";
     }
-    const char *names[] = {"control", "background", "deferred"};
+    const char *names[] = {"control", "background", "deferred", "identify"};
     for (unsigned event = 0; event < XCP_EVENTS; event++) {
         const std::string name = names[event];
         EXPECT_EQ(send({0xD7, 0, uint8_t(event), 0}), (bytes_t{0xFF, 0x04, 1, uint8_t(name.size()), 0, 0, 0}));
@@ -455,7 +455,7 @@ TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     };
     const uint32_t end = sizeof(drive_t);
     const std::pair<unsigned, std::vector<uint32_t>> wrong[] = {
-        {XCP_SCOPE_EVENT, {0, 4, 258, 0xFFFFFFFFu}},
+        {XCP_SCOPE_EVENT, {0, 5, 258, 0xFFFFFFFFu}},
         {XCP_SCOPE_DIVIDER, {0, 65536, 65537}},
         {XCP_SCOPE_BEFORE, {2047, 65536 + 5}},
         {XCP_SCOPE_CONDITION, {SAMPLER_CONDITIONS, 256, 0xFFFFFFFFu}},

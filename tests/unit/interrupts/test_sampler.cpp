@@ -64,7 +64,7 @@ sampler_setup_t any_setup(std::mt19937 &random, const part_t &part, int64_t leve
     for (unsigned i = 0; i < setup.channels; i++) {
         setup.word[i] = uint16_t(random() % WORDS);
     }
-    setup.event = sampler_event_t(1 + random() % 3);
+    setup.event = sampler_event_t(1 + random() % 4);
     setup.divider = uint16_t(random() % 3 == 0 ? 1 : 1 + random() % 5);
     const unsigned most = SAMPLER_WORDS / setup.channels - 2;
     const unsigned kind = random() % 4;
@@ -243,7 +243,7 @@ TEST_F(Sampler, records_each_deferred_step_once_at_the_first_control_interrupt_a
             recorded = steps;
         }
     }
-    EXPECT_EQ(SAMPLER_EVENT_BACKGROUND & SAMPLER_IN_CONTROL, 0u);
+    EXPECT_EQ((SAMPLER_EVENT_BACKGROUND | SAMPLER_EVENT_IDENTIFY) & SAMPLER_IN_CONTROL, 0u);
 }
 
 TEST_F(Sampler, compares_an_unsigned_word_with_a_level_of_its_kind) {
@@ -301,7 +301,7 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
         refuses(
             "event 0", [](auto &s) { s.event = sampler_event_t(0); }, streams);
         refuses(
-            "event 4", [](auto &s) { s.event = sampler_event_t(4); }, streams);
+            "event 5", [](auto &s) { s.event = sampler_event_t(5); }, streams);
         refuses(
             "divider", [](auto &s) { s.divider = 0; }, streams);
         refuses(

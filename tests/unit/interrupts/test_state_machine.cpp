@@ -189,6 +189,39 @@ TEST_F(StateMachine, a_run_request_from_power_on_does_not_start_the_drive) {
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_RUN);
 }
 
+TEST(StateMachineExperiments, they_begin_in_ready_alone_and_end_with_every_other_request_and_fault) {
+    for (const drive_state_t state : {DRIVE_STATE_INITIALISE, DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE_STATE_FAULT}) {
+        for (const bool rearmed : {false, true}) {
+            state_machine_t machine{};
+            machine.state = state;
+            machine.rearmed = rearmed;
+            EXPECT_FALSE(tick(machine, {0, COMMAND_IDENTIFY, true}));
+            EXPECT_EQ(machine.identifies, state == DRIVE_STATE_READY && rearmed) << state;
+            EXPECT_EQ(machine.state == DRIVE_STATE_RUN, machine.identifies) << state;
+        }
+    }
+    state_machine_t machine{};
+    for (const command_request_t request : {COMMAND_OFF, COMMAND_STOP, COMMAND_CLEAR_FAULT}) {
+        machine.state = DRIVE_STATE_READY;
+        machine.rearmed = true;
+        tick(machine, {0, COMMAND_IDENTIFY, true});
+        ASSERT_TRUE(machine.identifies);
+        tick(machine, {0, COMMAND_IDENTIFY, false});
+        ASSERT_TRUE(machine.identifies);
+        const state_machine_input_t goes_on = {0, COMMAND_IDENTIFY, true};
+        EXPECT_FALSE(state_machine_runs(&machine, &goes_on)) << "the control laws do not run";
+        tick(machine, {0, request, true});
+        EXPECT_EQ(machine.state, DRIVE_STATE_READY) << request;
+        EXPECT_FALSE(machine.identifies);
+    }
+    tick(machine, {0, COMMAND_IDENTIFY, true});
+    EXPECT_TRUE(tick(machine, {TIMEOUT, COMMAND_IDENTIFY, true}));
+    EXPECT_EQ(machine.state, DRIVE_STATE_FAULT);
+    EXPECT_FALSE(machine.identifies);
+    tick(machine, {0, COMMAND_IDENTIFY, true});
+    EXPECT_FALSE(machine.rearmed) << "a request that persists does not begin again";
+}
+
 TEST_F(StateMachine, a_command_timeout_is_a_fault_in_run_only) {
     for (uint32_t k = 0; k < INITIALISE_TICKS; k++) {
         step(COMMAND_OFF, TIMEOUT);

@@ -47,6 +47,29 @@ inline hal_can_frame_t torque_command(uint8_t counter, unsigned request, int32_t
                            counter, message, drive_torque_command_pack);
 }
 
+// DRIVE_IDENTIFY_COMMAND with its checksum; the values are not checked.
+inline hal_can_frame_t identify_command(uint8_t counter, unsigned request, unsigned kind, unsigned phase,
+                                        uint8_t number = 1) {
+    drive_identify_command_t message{};
+    message.request = uint8_t(request);
+    message.kind = uint8_t(kind);
+    message.phase = uint8_t(phase);
+    message.number = number;
+    message.level = 1234;
+    message.time_ms = 56;
+    return protected_frame(DRIVE_IDENTIFY_COMMAND_FRAME_ID, DRIVE_IDENTIFY_COMMAND_LENGTH,
+                           DRIVE_IDENTIFY_COMMAND_E2E_DATA_ID, counter, message, drive_identify_command_pack);
+}
+
+// DRIVE_IDENTIFY_WINDOW with its checksum.
+inline hal_can_frame_t identify_window(uint8_t counter, uint16_t angle, uint16_t width) {
+    drive_identify_window_t message{};
+    message.angle = angle;
+    message.width = width;
+    return protected_frame(DRIVE_IDENTIFY_WINDOW_FRAME_ID, DRIVE_IDENTIFY_WINDOW_LENGTH,
+                           DRIVE_IDENTIFY_WINDOW_E2E_DATA_ID, counter, message, drive_identify_window_pack);
+}
+
 // DRIVE_ARM with its checksum; the values are not checked.
 inline hal_can_frame_t arm(uint8_t counter, unsigned step, uint32_t response = 0) {
     drive_arm_t message{};

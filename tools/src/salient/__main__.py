@@ -139,6 +139,12 @@ def _tab(options: argparse.Namespace) -> int:
     return run(options.out, options.machine)
 
 
+def _identify(options: argparse.Namespace) -> int:
+    from salient.identify.command import run
+
+    return run(options)
+
+
 def _scope(options: argparse.Namespace) -> int:
     from salient.bench.scope import run
 
@@ -233,6 +239,7 @@ _COMMANDS = {
     "view": _view,
     "tab": _tab,
     "scope": _scope,
+    "identify": _identify,
     "parameters": _parameters,
     "benchmark": _benchmark,
     "compare": _compare,

@@ -286,6 +286,25 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     _add_databases(scope, "whose signals while the buffer is read are a table, too, and whose messages are watched")
     _add_bit_rates(scope)
 
+    identify = command("identify", "a drive measures its own motor: machine file with flux-linkage map, and a page")
+    _add_can(identify)
+    identify.add_argument("--machine", required=True, metavar="NAME|FILE", help="name plate: poles, board and ratings, "
+                          "in the machine file that the drive carries; its magnetics are not used")
+    identify.add_argument("--true-machine", type=_option_type("true_machine"), metavar="NAME|FILE",
+                          help="instead of --can: simulates a drive of the name plate with this motor")
+    identify.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
+                          help="with --true-machine: variable of the test bench; may be repeated")
+    for name, kind in (("encoder_bits", "encoder_bits"), ("seed", "seed")):
+        identify.add_argument(f"--{name.replace('_', '-')}", dest=name, type=_option_type(kind), metavar="N",
+                              help=f"with --true-machine: {OPTIONS[name].help} (default as the name plate)")
+    identify.add_argument("--bins", type=_count, default=36, metavar="N",
+                          help="windows of an electrical revolution from which pulses begin (default %(default)s)")
+    identify.add_argument("--repeats", type=_count, default=2, metavar="N",
+                          help="pulses of each window (default %(default)s)")
+    identify.add_argument("--out", type=Path, default=OUT / "identify" / "motor.toml", metavar="FILE.toml",
+                          help="machine file; its map and its page have the same name (default %(default)s)")
+    _add_node(identify)
+
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
     for name, text in (("save", "write the parameters to a file"),

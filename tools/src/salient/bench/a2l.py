@@ -24,7 +24,7 @@ from salient.machine.scaling import Scaling, database_of, scaling_of
 ELEMENTS_MAX = 16
 """Limit of an array; the members of longer ones, as the rings of traces, are no signals."""
 BIT_RATE = 1_000_000
-EVENTS = ("control", "background", "deferred")
+EVENTS = ("control", "background", "deferred", "identify")
 _WORD_BYTES = 4
 _TYPES = {(1, False): "UBYTE", (1, True): "SBYTE", (2, False): "UWORD", (2, True): "SWORD", (4, False): "ULONG",
           (4, True): "SLONG"}

@@ -27,6 +27,8 @@ _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
 _POSITION_COMMAND = drive_database().get_message_by_name("DRIVE_POSITION_COMMAND")
 ORDERS = value_numbers(drive_database(), "DRIVE_POSITION_COMMAND", "order")
+_IDENTIFY_COMMAND, _IDENTIFY_WINDOW = "DRIVE_IDENTIFY_COMMAND", "DRIVE_IDENTIFY_WINDOW"
+EXPERIMENTS = value_numbers(drive_database(), _IDENTIFY_COMMAND, "kind")
 REQUESTS = value_numbers(drive_database(), "DRIVE_COMMAND", "request")
 assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
@@ -90,6 +92,28 @@ def _protected(command: Message, counter: int, request: str, reference: Mapping[
     return e2e.protected_frame(command, counter, {"request": REQUESTS[request], **reference})
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment of a drive that measures its own motor (firmware/control/identify.h). kind: one of EXPERIMENTS;
+    phase: from 0; level: current, part of current_limit_A, 0 to below 1; time_ms: 0 to 4095; angle, width: window, of
+    a revolution of the encoder, 0 to below 1. ValueError: out of these ranges."""
+
+    kind: str
+    phase: int = 0
+    level: float = 0.0
+    time_ms: int = 0
+    angle: float = 0.0
+    width: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in EXPERIMENTS:
+            raise ValueError(f"kind {self.kind}: must be {either(list(EXPERIMENTS))}")
+        for name, low, high in (("phase", 0, 5), ("level", 0, 4095 / 4096), ("time_ms", 0, 4095),
+                                ("angle", 0, 65535 / 65536), ("width", 0, 65535 / 65536)):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} {getattr(self, name)}: must be from {low} to {high:g}")
+
+
 class Drive(KnownAttributes):
     """Commands a drive. Assigning speed_reference_rpm, torque_reference_Nm or position_deg requests run in speed, torque
     or position mode; the command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
@@ -117,6 +141,8 @@ class Drive(KnownAttributes):
         self._position_deg = 0.0
         self._order = "profile"
         self._mode = "speed"
+        self._experiment = Experiment("rest")
+        self._experiment_number = 0
         self._counter = 0
         self._arming: ArmingSequence | None = None
         self._arming_counter = 0
@@ -190,6 +216,19 @@ class Drive(KnownAttributes):
         self._order = order
         self._mode = "position"
         self.ask("run")
+
+    def begin_experiment(self, experiment: Experiment) -> int:
+        """Requests an experiment; returns its number, 0 to 255, the lowest four bits of which its records have. The
+        first one, outside of a run, arms the drive; it begins a run, which ends without commands, as any other."""
+        self._experiment = experiment
+        self._mode = "experiment"
+        self._experiment_number = (self._experiment_number + 1) % 256
+        window = self._session.drive_database.get_message_by_name(_IDENTIFY_WINDOW)
+        self._session.send(e2e.protected_frame(window, self._counter, {
+            "angle": experiment.angle, "width": experiment.width}))
+        self._counter = (self._counter + 1) % 256
+        self.ask("run")
+        return self._experiment_number
 
     def stop(self) -> None:
         """Ramp to zero, then open the switches."""
@@ -287,6 +326,8 @@ class Drive(KnownAttributes):
             self._session.send(position_command_frame(counter, self._request, self._order, self._position_deg,
                                                       self._position_command))
             period_ns += COMMAND_PERIOD_NS // 2 if self._order == "cyclic" else 0  # not beside the next one
+        elif self._mode == "experiment":
+            self._session.send(self._experiment_frame(self._experiment, counter))
         elif self._mode == "torque":
             self._session.send(torque_command_frame(counter, self._request, self._torque_reference_Nm,
                                                     self._torque_command))
@@ -294,6 +335,13 @@ class Drive(KnownAttributes):
             self._session.send(command_frame(counter, self._request, self._speed_reference_rpm, self._command))
         self._counter = (counter + 1) % 256
         self.command_due_ns = self._session.time_ns + period_ns
+
+    def _experiment_frame(self, experiment: Experiment, counter: int) -> can.Message:
+        assert self._request is not None
+        message = self._session.drive_database.get_message_by_name(_IDENTIFY_COMMAND)
+        return e2e.protected_frame(message, counter, {
+            "request": REQUESTS[self._request], "kind": EXPERIMENTS[experiment.kind], "phase": experiment.phase,
+            "number": self._experiment_number, "level": experiment.level, "time_ms": experiment.time_ms})
 
     @property
     def state(self) -> str:

@@ -20,6 +20,7 @@ from salient.bench.arming import response_to
 from salient.bench.xcp import AREA_PARAMETERS
 from salient.bus import e2e
 from salient.bus.signals import FrameKey, drive_database, frame_key, rig_database
+from salient.dbc import PHASES
 from salient.machine.file import load_machine, machine_path
 from salient.machine.parameter_table import read_table, value_name
 from salient.machine.scaling import Exponents, scaling_of
@@ -145,11 +146,13 @@ class _Reader:
         self._staged: list[str] = []
         self._staged_ns = 0
         self._xcp_address = 0
+        self._window_text = ""
         self._sets: dict[bytes, Stimulus] = {}
         self._profile: Stimulus | None = None
         self._unanswered: dict[tuple[str, int], deque[tuple[int, Stimulus]]] = defaultdict(deque)
         self._take = {"DRIVE_COMMAND": self._command_frame, "DRIVE_TORQUE_COMMAND": self._command_frame,
                       "DRIVE_POSITION_COMMAND": self._command_frame,
+                      "DRIVE_IDENTIFY_COMMAND": self._experiment, "DRIVE_IDENTIFY_WINDOW": self._window,
                       "DRIVE_ARM": self._arm, "PARAMETER_WRITE": self._write, "PARAMETER_SET_CONTROL": self._control,
                       "PARAMETER_REQUEST": self._parameter_request, "DRIVE_ARMING": self._arming_report,
                       "PARAMETER_RESPONSE": self._parameter_response, "RIG_SET": self._rig_set,
@@ -215,6 +218,28 @@ class _Reader:
             self._add(time_ns, f"run in {mode} mode, {name} = {_with_unit(values[name], unit)}")
         else:
             self._add(time_ns, f"request {request}")
+
+    def _experiment(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:
+        del frame
+        self._commands_ceased(time_ns)
+        request, kind = str(values["request"]), str(values["kind"])
+        command = (request, "experiment", int(values["number"])) if request == "run" else (request,)
+        self._command_ns, self._command_period_ns = time_ns, (message.cycle_time or 0) * 1_000_000
+        if command == self._command:
+            return
+        self._command = command
+        if request != "run":
+            self._add(time_ns, f"request {request}")
+            return
+        self._forget_arming()
+        self._run_ns = time_ns
+        of = "" if kind == "rest" else f" of phase {PHASES[int(values['phase'])]} at {float(values['level']):.4f}"
+        self._add(time_ns, f"experiment {int(values['number'])}: {kind}{of}{self._window_text}")
+        self._window_text = ""
+
+    def _window(self, time_ns: int, message: Message, frame: can.Message, values: dict[str, Any]) -> None:
+        del time_ns, message, frame
+        self._window_text = f", window {float(values['angle']):.5f} + {float(values['width']):.5f} rev"
 
     def _commands_ceased(self, time_ns: int) -> None:
         """Notes that there have been no commands for longer than their period: the drive stops for that."""

@@ -1,0 +1,185 @@
+"""A drive that measures its own motor: experiments, limits, the loss of the client, and the machine that it finds."""
+
+from __future__ import annotations
+
+import math
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from salient.bench.drive import Experiment
+from salient.identify.command import identify
+from salient.identify.link import IDLE, IdentifyError, linked
+from salient.identify.result import write_machine
+from salient.identify.sequence import Sequence
+from salient.machine.file import load_machine
+from salient.machine.path import machine_path
+
+LIMIT_A = 52.0
+GATES_OFF_S = 1e-3
+
+
+def plate_of(folder: Path, *changes: tuple[str, str]) -> Path:
+    """A name plate of `saturating`: another flux linkage, resistance and inertia than the motor's."""
+    text = machine_path("saturating").read_text(encoding="utf-8")
+    of_others = (('name = "saturating"', 'name = "plate"'),
+                 ("\naligned_inductance_H = 23.6e-3", "\naligned_inductance_H = 0.03"),
+                 ("resistance_ohm = 0.05", "resistance_ohm = 0.1"), ("inertia_kg_m2 = 0.02", "inertia_kg_m2 = 0.01"))
+    for old, new in (*of_others, *changes):
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    path = folder / "plate.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def identifying(make_bench):
+    def make(**options):
+        return make_bench(controller="salient", telemetry_period_ms=20, **options)
+    return make
+
+
+def pulse_level_A(bench) -> float:
+    return max(float(np.max(bench.truth[f"current_{phase}_A"].value)) for phase in "abc")
+
+
+def test_the_machine_is_found_and_the_name_plate_s_magnetics_are_not_used(identifying, tmp_path):
+    plate = plate_of(tmp_path)
+    bench = identifying(machine=str(plate), true_machine="saturating")
+    result = identify(bench, load_machine(plate), 24, 1, lambda _: None)
+    found = write_machine(result, plate, tmp_path / "motor.toml")
+    true = load_machine(machine_path("saturating"))
+    angle, current = np.meshgrid(np.linspace(0.0, math.pi / 4.0, 31), np.linspace(0.02, 0.95, 30) * LIMIT_A,
+                                 indexing="ij")
+    flux = true.magnetics.flux_linkage_Wb(angle, current)
+    torque = true.magnetics.torque_Nm(angle, current)
+    flux_error = found.magnetics.flux_linkage_Wb(angle, current) - flux
+    torque_error = found.magnetics.torque_Nm(angle, current) - torque
+    assert np.sqrt(np.mean(flux_error**2)) < 0.001 * flux.max()
+    assert np.sqrt(np.mean(torque_error**2)) < 0.004 * np.abs(torque).max()
+    assert found.resistance_ohm == pytest.approx(true.resistance_ohm, rel=0.005)
+    assert found.inertia_kg_m2 == pytest.approx(true.inertia_kg_m2, rel=0.02)
+    assert found.friction_Nm_s == pytest.approx(true.friction_Nm_s, rel=0.05)
+    assert not result.warnings
+    assert result.log["current_A"].max() <= 1.05 * LIMIT_A
+    assert pulse_level_A(bench) <= 1.05 * LIMIT_A
+    assert bench.time_s < 30.0
+
+
+def test_only_one_phase_carries_current_and_all_are_off_at_the_end(identifying):
+    bench = identifying()
+    with linked(bench) as link:
+        for phase in range(3):
+            log = link.run(Experiment("pulse", phase, 0.5), 0.2)
+            assert 0.4 * LIMIT_A < log["current_A"].max() <= 0.5 * LIMIT_A
+            assert log["state"][-1] == IDLE
+    bench.run_for(0.02)
+    assert bench.drive.state == "ready"
+    assert not bench.drive.armed
+
+
+def test_a_run_does_not_follow_from_experiments(identifying):
+    bench = identifying()
+    with linked(bench) as link:
+        link.rest(0.02)
+        bench.drive.speed_reference_rpm = 300
+        bench.run_for(0.2)
+        assert abs(bench.truth["speed_rpm"].last) < 1.0
+        assert bench.drive.fault == "command_error"  # commands that the drive does not take
+    bench.run_for(0.05)
+    bench.drive.clear_fault()
+    bench.run_for(0.1)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.3)
+    assert bench.drive.state == "run"
+    assert bench.truth["speed_rpm"].last == pytest.approx(300, abs=5)
+
+
+@pytest.mark.parametrize("controller", ["traditional", "paper"])
+def test_other_controllers_are_refused_by_name(make_bench, controller):
+    bench = make_bench(controller=controller, telemetry_period_ms=20)
+    with pytest.raises(IdentifyError, match="controller must be salient"), linked(bench):
+        pass
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_loss_of_the_client_at_any_instant_opens_the_switches(identifying, seed):
+    """Within the command timeout; the drive is usable again."""
+    bench = identifying(seed=seed + 1)
+    of = random.Random(seed)
+    with linked(bench) as link:
+        link.run(Experiment("pulse", 0, 0.1), 0.2)
+        kind = of.choice(["hold", "pulse", "freewheel"])
+        bench.drive.begin_experiment(Experiment(kind, 0, 0.4, time_ms=4000))
+        bench.run_for(of.uniform(0.0, 0.03))
+        bench.drive.silence()
+        bench.run_for(0.05 + 0.01 + GATES_OFF_S)
+        bench.run_for(0.03)
+        assert bench.drive.state == "ready"
+        assert abs(bench.truth["current_a_A"].last) < 0.1
+        bench.run_for(1.0)
+        assert abs(bench.truth["current_a_A"].last) < 0.1
+        link._take()
+    bench.run_for(0.05)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.4)
+    assert bench.drive.state == "run"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_fault_at_any_instant_ends_them_and_can_be_cleared(identifying, seed):
+    bench = identifying(seed=seed + 1)
+    of = random.Random(seed)
+    with linked(bench) as link:
+        link.run(Experiment("pulse", 0, 0.1), 0.2)
+        bench.drive.begin_experiment(Experiment("hold", 0, 0.4))
+        bench.run_for(of.uniform(0.0, 0.03))
+        bench.rig.sto_1 = bench.rig.sto_2 = 1
+        bench.run_for(0.05)
+        assert abs(bench.truth["current_a_A"].last) < 0.1
+        with pytest.raises(IdentifyError, match="fault sto"):
+            link.check()
+    bench.rig.sto_1 = bench.rig.sto_2 = 0
+    bench.run_for(0.05)
+    bench.drive.clear_fault()
+    bench.run_for(0.1)
+    assert bench.drive.state == "ready"
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.4)
+    assert bench.drive.state == "run"
+
+
+def test_an_open_winding_is_refused_by_name(identifying):
+    bench = identifying()
+    bench.fault("winding_open", phase="b")
+    with linked(bench) as link:
+        sequence = Sequence(link, 3, 4, lambda _: None)
+        with pytest.raises(IdentifyError, match="phase b: no current"):
+            sequence.probe()
+
+
+def test_experiments_out_of_range_are_refused():
+    for wrong in ({"kind": "spin"}, {"kind": "pulse", "phase": 6}, {"kind": "pulse", "level": 1.0},
+                  {"kind": "pulse", "time_ms": 4096}, {"kind": "pulse", "angle": -0.1}):
+        with pytest.raises(ValueError, match=next(reversed(wrong))):
+            Experiment(**wrong)
+
+
+@pytest.mark.parametrize(("options", "text"), [
+    (["--seed", "2"], "--seed: only with --true-machine"),
+    (["--out", "motor.txt"], "must be FILE.toml"),
+    (["--true-machine", "saturating", "--set", "encoder_offset_deg=9"], "must be a number from -5 to 5"),
+    (["--true-machine", "finite_element"], "must have the same number"),
+])
+def test_a_mistake_in_an_option_is_one_line_and_leaves_no_file(tmp_path, options, text):
+    command = [sys.executable, "-m", "salient", "identify", "--machine", "saturating", "--out", "motor.toml", *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stdout
+    assert text in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not [path for path in tmp_path.iterdir() if path.is_file()]

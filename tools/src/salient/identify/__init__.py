@@ -1,0 +1,1 @@
+"""Identification: a drive measures its own motor, whose flux linkages nobody knows."""

@@ -1,0 +1,262 @@
+"""The electrical part of the machine from the pulses, as one least-squares problem:
+
+    integral of s Vdc dt = psi(theta - delta, i) + R integral of i dt + 2 V t
+
+s is +1 with both switches on, 0 freewheeling, -1 with both off. psi is linear in the coefficients of its spline, and
+so are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newton) add what is not: the angle of each
+phase, the delay of the current sensors, their offsets, the eccentricity of the encoder.
+
+Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and
+what the drop of a switch differs from that of a diode.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, sparse
+
+from salient.identify.basis import FluxBasis
+from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
+from salient.identify.sequence import Findings, Pulse
+
+ANGLES, CURRENTS = 48, 24
+_ITERATIONS = 5
+_ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
+"""Of the roughness, relative to the mean weight of a coefficient."""
+_DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
+"""Deviations of weak priors, for what a machine may not show."""
+_BEGIN_PART = 0.03
+_MOST = 0.5
+"""Part of the pulses that may end at less than the map."""
+_INITIAL_PART, _LEAST_PART = 0.1, 0.1
+"""The least incremental inductance is that part of the one of the unaligned phase, which is read at that part of the
+largest current."""
+_SIGN_WEIGHT, _SIGN_ROUNDS = 10.0, 8
+"""Weight of a sign, relative to the samples; rounds in which more of them may appear."""
+_SIGN = {OFF: -1.0, ZERO: 0.0, ON: 1.0}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Samples of pulses. angle_rad: from the rough aligned angle; shaft_rad: of the encoder; flux_Wb: integral of the
+    voltage; charge_As: of the current; time_s: since the begin of the pulse; slope_A_s: of the current before the
+    sample; pulse: number."""
+
+    pulse: np.ndarray
+    row: np.ndarray
+    angle_rad: np.ndarray
+    shaft_rad: np.ndarray
+    current_A: np.ndarray
+    flux_Wb: np.ndarray
+    charge_As: np.ndarray
+    time_s: np.ndarray
+    slope_A_s: np.ndarray
+
+
+def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
+    """The samples with current of pulses."""
+    parts: list[list[np.ndarray]] = []
+    for number, pulse in enumerate(pulses):
+        part = _rows(found, pulse)
+        if part is not None:
+            parts.append([np.full(len(part[0]), number), np.full(len(part[0]), found.phases.index(pulse.phase)), *part])
+    if not parts:
+        raise IdentifyError("no pulse has a current")
+    return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def within(rows: Rows, current_A: float) -> Rows:
+    """The rows up to a current."""
+    kept = rows.current_A <= current_A
+    return Rows(*(column[kept] for column in vars(rows).values()))
+
+
+def common_current_A(pulses: Sequence[Pulse]) -> float:
+    """Largest current of most pulses; beyond, only some angles would have samples."""
+    return float(np.quantile([pulse.log["current_A"].max() for pulse in pulses if pulse.mapped], _MOST))
+
+
+def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
+    log = pulse.log
+    current = log["current_A"] - found.offset_A[pulse.phase]
+    on = np.nonzero(log["action"] == ON)[0]
+    if not len(on) or (log["action"] == PART).any():
+        return None
+    if on[0] == 0 or current[on[0]] > _BEGIN_PART * current.max():  # it began with the current of another one
+        return None
+    floor_A = 4.0 * found.noise_A[pulse.phase] + 0.01 * current.max()
+    first = on[0]
+    dead = np.nonzero(current[first + 1:] <= floor_A)[0]
+    late = dead[dead + first + 1 > np.argmax(current)]
+    last = first + (int(late[0]) if len(late) else len(current) - 1 - first)
+    if last <= first + 1:
+        return None
+    step_s = np.diff(log["time_us"][first:last + 1]) * 1e-6
+    sign = np.vectorize(_SIGN.get, otypes=[float])(log["action"][first:last])
+    voltage = (log["dc_link_V"][first:last] + log["dc_link_V"][first + 1:last + 1]) / 2.0
+    mean_A = (current[first:last] + current[first + 1:last + 1]) / 2.0
+    flux, charge, time_s = np.cumsum(sign * voltage * step_s), np.cumsum(mean_A * step_s), np.cumsum(step_s)
+    turn = log["turn"][first + 1:last + 1]
+    live = current[first + 1:last + 1] > floor_A
+    at = np.arange(first + 1, last + 1)
+    slope = (current[at] - current[at - 1]) / step_s
+    columns = [2.0 * math.pi * (turn - found.position[pulse.phase]), 2.0 * math.pi * turn, current[at], flux, charge,
+               time_s, slope]
+    return [column[live] for column in columns]
+
+
+@dataclass
+class Fit:
+    """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
+    device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest."""
+
+    basis: FluxBasis
+    coefficients: np.ndarray
+    resistance_ohm: float
+    drop_V: float
+    delta_rad: np.ndarray
+    eccentricity_rad: np.ndarray
+    delay_s: float
+    offset_A: np.ndarray
+    residual_Wb: np.ndarray
+
+    def flux_Wb(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
+        """Flux linkage at an angle from aligned."""
+        return self.basis.value(self.coefficients, angle_rad, current_A)
+
+    def torque_Nm(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
+        """Derivative of the co-energy by the angle."""
+        return self.basis.value(self.coefficients, angle_rad, current_A, 1, -1)
+
+    def shaft_rad(self, encoder_rad: np.ndarray) -> np.ndarray:
+        """Angle of the shaft by that of the encoder."""
+        cosine, sine = self.eccentricity_rad
+        return np.asarray(encoder_rad - cosine * np.cos(encoder_rad) - sine * np.sin(encoder_rad))
+
+
+def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angles: int = ANGLES,
+          currents: int = CURRENTS) -> Fit:
+    """The machine that explains the rows best."""
+    basis = FluxBasis(rotor_poles, current_max_A, angles, currents)
+    fit = Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
+              np.zeros(0))
+    rough = basis.roughness()
+    for iteration in range(_ITERATIONS):
+        fit = _solution(_problem(rows, phases, fit, rough, linear=iteration == 0), rows, phases)
+    return fit
+
+
+def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Angles from aligned and currents of the rows with what is known of the sensors."""
+    cosine, sine = fit.eccentricity_rad
+    angle = (rows.angle_rad - fit.delta_rad[rows.row] - cosine * np.cos(rows.shaft_rad) - sine * np.sin(rows.shaft_rad))
+    return angle, np.maximum(rows.current_A + fit.offset_A[rows.row] + fit.delay_s * rows.slope_A_s, 0.0)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """A least-squares problem about a fit. forms: of the roughness, weighted; known, deviations: of the priors of the
+    further columns."""
+
+    fit: Fit
+    design: sparse.csr_matrix
+    forms: np.ndarray
+    known: np.ndarray
+    deviations: np.ndarray
+    linear: bool
+    signs: sparse.csr_matrix
+    least: np.ndarray
+
+
+def _signs(basis: FluxBasis) -> sparse.csr_matrix:
+    """What no machine has negative, on a grid of both directions: the incremental inductance, scaled by the largest
+    current, and the fall of the flux linkage from aligned to unaligned, by the pitch."""
+    angle, current = np.meshgrid(np.linspace(0.0, math.pi / basis.rotor_poles, basis.angles + 1),
+                                 np.linspace(0.0, basis.current_max_A, basis.columns), indexing="ij")
+    rises = basis.design(angle.ravel(), current.ravel(), 0, 1) * basis.current_max_A
+    falls = basis.design(angle[1:-1, 1:].ravel(), current[1:-1, 1:].ravel(), 1, 0) * (-math.pi / basis.rotor_poles)
+    return sparse.vstack([rises, falls]).tocsr()
+
+
+def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> _Problem:
+    """About the present angles, delay and offsets unless `linear`."""
+    basis, n = fit.basis, fit.basis.size
+    angle, current = _corrected(rows, fit)
+    columns = [rows.charge_As, 2.0 * rows.time_s]
+    deviations, known = [math.inf, _DROP_V], [0.0, 0.0]
+    if not linear:
+        by_angle = basis.value(fit.coefficients, angle, current, 1, 0)
+        by_current = basis.value(fit.coefficients, angle, current, 0, 1)
+        of_phase = [(rows.row == row).astype(float) for row in range(phases)]
+        columns += [-by_angle * each for each in of_phase]
+        columns += [-by_angle * np.cos(rows.shaft_rad), -by_angle * np.sin(rows.shaft_rad), by_current * rows.slope_A_s]
+        columns += [by_current * each for each in of_phase]
+        deviations += [math.inf] * phases + [_ECCENTRICITY_RAD] * 2 + [_DELAY_S]
+        deviations += [_OFFSET_PART * basis.current_max_A] * phases
+        known += [0.0] * phases + [*-fit.eccentricity_rad, -fit.delay_s, *-fit.offset_A]
+    design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
+    scale = float(design[:, :n].multiply(design[:, :n]).sum()) / n
+    forms = scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
+    signs = _signs(basis)
+    least = np.zeros(signs.shape[0])
+    if not linear:
+        unaligned = float(basis.value(fit.coefficients, np.array(math.pi / basis.rotor_poles),
+                                      np.array(_INITIAL_PART * basis.current_max_A))) / _INITIAL_PART
+        least[:basis.rows * basis.columns] = _LEAST_PART * max(unaligned, 0.0)
+    return _Problem(fit, design, forms, np.array(known), np.array(deviations), linear, signs, least)
+
+
+def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | None = None) -> Fit:
+    """The fit of a problem, with a weight of each row. IdentifyError: the pulses do not determine the machine."""
+    fit, design = problem.fit, problem.design
+    n = fit.basis.size
+    weighted = design if weights is None else design.multiply(weights[:, None]).tocsr()
+    normal, right = (weighted.T @ design).toarray(), weighted.T @ rows.flux_Wb
+    normal[:n, :n] += problem.forms
+    noise = float(np.mean(fit.residual_Wb**2)) if len(fit.residual_Wb) == len(rows.flux_Wb) else \
+        (2e-4 * float(np.abs(rows.flux_Wb).max())) ** 2
+    for k, deviation in enumerate(problem.deviations, start=n):
+        normal[k, k] += 1e-12 * normal[k, k] if math.isinf(deviation) else noise / deviation**2
+        right[k] += 0.0 if math.isinf(deviation) else problem.known[k - n] * noise / deviation**2
+    x = _constrained(problem, normal, right, n)
+    more = np.zeros(2 * phases + 3) if problem.linear else x[n + 2:]
+    return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
+               fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
+               fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x)
+
+
+def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
+    """The solution whose signs are those of a machine: those that are not are drawn to their least value, with the
+    rest of the map. IdentifyError: there is none."""
+    signs, least = problem.signs, problem.least
+    weight = _SIGN_WEIGHT * float(np.trace(normal[:n, :n])) / float(signs.multiply(signs).sum())
+    active = np.zeros(signs.shape[0], bool)
+    for _ in range(_SIGN_ROUNDS):
+        held = signs[active]
+        of = normal.copy()
+        of[:n, :n] += weight * (held.T @ held).toarray()
+        more = right.copy()
+        more[:n] += weight * (held.T @ least[active])
+        try:
+            x = linalg.solve(of, more, assume_a="pos", check_finite=False)
+        except linalg.LinAlgError:
+            raise IdentifyError("the pulses do not determine the machine") from None
+        violated = (signs @ x[:n] < least) & ~active
+        if problem.linear or not violated.any():
+            return np.asarray(x)
+        active |= violated
+    return np.asarray(x)
+
+
+def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:
+    """The fit of pulses drawn with repetition, once in each sample: its scatter is that of the result, whatever
+    correlates the rows of a pulse."""
+    problem = _problem(rows, phases, fit, fit.basis.roughness(), linear=False)
+    random = np.random.default_rng(seed)
+    pulses = int(rows.pulse.max()) + 1
+    return [_solution(problem, rows, phases, random.multinomial(pulses, np.full(pulses, 1.0 / pulses))[rows.pulse]
+                      .astype(float)) for _ in range(samples)]

@@ -1,0 +1,204 @@
+"""Experiments of a drive over a session, and their record, which XCP sends while they last.
+
+A record of a control period has current and voltage of the phase of the experiment, angle and switches: each period of
+a pulse, and one in a millisecond between (firmware/control/identify.h). A lost record is an error, never a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from salient.bench.drive import Experiment
+from salient.bench.sampler import _check_layout, _control_rate_hz, _member, variables_of
+from salient.bench.session import Session
+from salient.bench.xcp import connected
+from salient.errors import RunFailed
+
+if TYPE_CHECKING:
+    from pyxcp.master.master import Master
+
+RECORD = np.dtype([("time_us", "i8"), ("current_A", "f8"), ("dc_link_V", "f8"), ("turn", "f8"), ("phase", "u1"),
+                   ("action", "u1"), ("state", "u1"), ("number", "u1")])
+"""turn: angle of the encoder in revolutions, continuous over the whole session."""
+IDLE, HOLDS, WAITS, CHARGES, FREEWHEELS, DISCHARGES, RESTS, ENDED = range(8)
+"""identify_state_t."""
+OFF, ZERO, ON, PART = range(4)
+"""identify_action_t."""
+LIMITS = ("none", "a current is more than 3 % beyond current_limit_A", "a winding has had its copper loss",
+          "the rotor has turned by 256 revolutions", "they last longer than 120 s",
+          "the parameter controller must be salient")
+"""Reasons by identify_limit_t."""
+_EVENT_IDENTIFY = 3
+_TIMESTAMP = 0x10
+_ANGLE_BITS, _NUMBER_MASK = 20, 15
+_STEP_NS = 500_000
+_KEEP_ALIVE_NS = 4_000_000_000
+
+
+class IdentifyError(RunFailed):
+    """The drive has ended the experiments, or they tell nothing."""
+
+
+class Link:
+    """Experiments of the drive of a session. limit_A: the parameter current_limit_A, of which levels are parts;
+    period_s: control period; log: all records."""
+
+    def __init__(self, session: Session, master: Master) -> None:
+        self._session, self._master = session, master
+        variables = variables_of(session)
+        self._variables = variables
+        _check_layout(master, variables)
+        self.period_s = 1.0 / _control_rate_hz(session)
+        self.limit_A = float(session.drive.parameters["current_limit_A"])
+        self._current_A = variables.quantity("control.measurement.current_q9[0]").factor
+        self._voltage_V = variables.quantity("control.measurement.dc_link_voltage_q6").factor
+        self._middle_rev = self._member("control_parameters.encoder_middle") / (1 << 32)
+        self._response_id = session.drive_database.get_message_by_name("XCP_RESPONSE").frame_id
+        self._parts: list[np.ndarray] = []
+        self._pending: bytes | None = None
+        self._time_us = self._turn = 0
+        self._kept_alive_ns = session.time_ns
+        self._start_stream()
+
+    @property
+    def time_s(self) -> float:
+        """Of the session."""
+        return self._session.time_s
+
+    @property
+    def log(self) -> np.ndarray:
+        """All records so far."""
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0] if self._parts else np.zeros(0, RECORD)
+
+    def _start_stream(self) -> None:
+        master = self._master
+        master.freeDaq()
+        master.allocDaq(1)
+        master.allocOdt(0, 2)
+        for odt in range(2):
+            master.allocOdtEntry(0, odt, 1)
+        for odt in range(2):
+            address = self._variables.quantity(f"identify.record[{odt}]").variable.address
+            master.setDaqPtr(0, odt, 0)
+            master.writeDaq(0xFF, 4, 0, address)
+        master.setDaqListMode(_TIMESTAMP, 0, _EVENT_IDENTIFY, 1, 0)
+        master.startStopDaqList(1, 0)
+
+    def _member(self, path: str) -> int:
+        return _member(self._master, self._variables, path)
+
+    def check(self) -> None:
+        """IdentifyError: a limit or a fault has ended the experiments, or records were lost."""
+        drive = self._session.drive
+        if drive.state == "fault":
+            raise IdentifyError(f"the drive has ended the experiments by the fault {drive.fault}")
+        limit = self._member("identify.limit")
+        if limit:
+            raise IdentifyError(f"the drive has ended the experiments: {LIMITS[limit]}")
+        lost = self._member("sampler.lost")
+        if lost:
+            raise IdentifyError(f"{lost} records were lost: the bus has no room for them")
+
+    def _take(self) -> np.ndarray:
+        """Records that have come since the last call; the session's log is emptied."""
+        frames = [bytes(frame.data) for _, frame in self._session.log
+                  if frame.arbitration_id == self._response_id and len(frame.data) and frame.data[0] < 2]
+        self._session.log.clear()
+        self._session.sent.clear()
+        raw = bytearray()
+        for frame in frames:
+            if frame[0] == 0:
+                self._pending = frame[1:7]
+            elif self._pending is not None:
+                raw += self._pending + frame[1:5]
+                self._pending = None
+        if not raw:
+            return np.zeros(0, RECORD)
+        words = np.frombuffer(bytes(raw), np.dtype([("time", "<u2"), ("first", "<u4"), ("second", "<u4")]))
+        return self._decoded(words)
+
+    def _decoded(self, words: np.ndarray) -> np.ndarray:
+        out = np.zeros(len(words), RECORD)
+        times_us = np.concatenate([[self._time_us & 0xFFFF], words["time"].astype(np.int64)])
+        steps = np.mod(np.diff(times_us), 65536)
+        out["time_us"] = self._time_us + np.cumsum(steps)
+        second = words["second"]
+        angle = (second >> 12).astype(np.int64)
+        full = 1 << _ANGLE_BITS
+        turned = np.mod(np.diff(np.concatenate([[self._turn % full], angle])) + full // 2, full) - full // 2
+        turn = self._turn + np.cumsum(turned)
+        out["turn"] = turn / full + self._middle_rev
+        out["phase"] = second >> 9 & 7
+        out["action"] = second >> 7 & 3
+        out["state"] = second >> 4 & 7
+        out["number"] = second & _NUMBER_MASK
+        out["current_A"] = (words["first"] & 0xFFFF) * self._current_A
+        out["dc_link_V"] = (words["first"] >> 16) * self._voltage_V
+        self._time_us, self._turn = int(out["time_us"][-1]), int(turn[-1])
+        self._parts.append(out)
+        return out
+
+    def _advance(self) -> np.ndarray:
+        self._session.advance_to(self._session.time_ns + _STEP_NS)
+        if self._session.time_ns - self._kept_alive_ns > _KEEP_ALIVE_NS:
+            self._kept_alive_ns = self._session.time_ns
+            self.check()
+        return self._take()
+
+    def run(self, experiment: Experiment, timeout_s: float) -> np.ndarray:
+        """Begins an experiment, and lets time pass until the drive is idle again, or until the timeout; returns its
+        records. IdentifyError: see check."""
+        number = self._session.drive.begin_experiment(experiment) & _NUMBER_MASK
+        begin_ns = self._session.time_ns
+        parts: list[np.ndarray] = []
+        while self._session.time_ns - begin_ns < round(1e9 * timeout_s):
+            part = self._advance()
+            part = part[part["number"] == number]
+            if len(part):
+                parts.append(part)
+                if part["state"][-1] == IDLE and experiment.kind != "rest":
+                    break
+                if part["state"][-1] == ENDED:
+                    self.check()
+        if not parts:
+            self.check()
+            raise IdentifyError(f"no record of an experiment within {timeout_s:g} s; the drive is in state "
+                                f"{self._session.drive.state}")
+        return np.concatenate(parts)
+
+    def rest(self, duration_s: float) -> np.ndarray:
+        """All switches off."""
+        return self.run(Experiment("rest"), duration_s)
+
+
+@contextmanager
+def linked(session: Session) -> Iterator[Link]:
+    """Arms the drive of a session for experiments, without one yet; at the end, whatever happens, it is switched off.
+    IdentifyError: it does not take them."""
+    with ExitStack() as stack:
+        master = stack.enter_context(connected(session))
+        drive = session.drive
+        drive.wait_until_ready()
+        stack.callback(drive.off)
+        link = Link(session, master)
+        drive.begin_experiment(Experiment("rest"))
+        deadline_s = session.time_s + 1.0
+        while drive.state != "run":
+            link.check()
+            if session.time_s > deadline_s or drive.state == "fault":
+                raise IdentifyError(f"the drive does not begin: state {drive.state}, fault {drive.fault}"
+                                    f"{'; ' + drive.hindrance if drive.hindrance else ''}")
+            session.run_for(1e-3)
+        yield link
+
+
+def degrees(turn: float) -> float:
+    """Of revolutions."""
+    return math.degrees(2.0 * math.pi * turn)

@@ -1,0 +1,279 @@
+"""The machine that the experiments show, with the uncertainty of each quantity and a verdict on it; and its file.
+
+Intervals are of 95 %, by resampling whole pulses (salient.identify.fit.resampled) or runs of windows (shaft). They hold
+the scatter of the pulses, not what no pulse shows.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from salient.identify import fit as electrical
+from salient.identify.fit import Fit
+from salient.identify.link import IdentifyError
+from salient.identify.sequence import Findings
+from salient.identify.shaft import Shaft, shaft_of
+from salient.machine.file import Machine, MachineError, load_machine
+from salient.machine.scaling import scaling_of
+
+SAMPLES = 16
+_INTERVAL = 1.96
+MAP_ANGLES, MAP_CURRENTS = 61, 48
+_REST_FLUX = 1e-6
+"""Least rise between two points of a map, of its largest flux linkage."""
+_FLAT_RESISTANCE, _FLAT_INERTIA, _FLAT_ANGLE_DEG, _FLAT_FLUX = 0.005, 0.02, 0.02, 0.001
+"""Half widths of intervals up to which a quantity counts as determined."""
+_NEAR_LIMIT = 0.9
+"""Largest current of the pulses, part of the limit, from which the map is continued to it; else it ends there."""
+_MODEL_PART = 0.0025
+"""What inertia and friction are wrong by without any noise, by the judge (salient.experiments.compare.identified)."""
+NOT_OBSERVABLE = (
+    ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
+     "pulses would be the same; by a meter in series"),
+    ("gain of the DC-link voltage", "scales flux linkage and resistance alike; by a voltmeter"),
+    ("drop of a switch less that of a diode", "acts as a change of the DC-link voltage"),
+    ("mutual coupling of the phases", "one phase alone carries current in each pulse"),
+    ("eddy currents, hysteresis", "not in the model of the fit; they show as its residual"),
+    ("differences of the phases", "the map is one of all phases; their aligned angles are not"),
+)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A row of the result: value and half width of the interval, in the unit; verdict: determined, uncertain, or a
+    reason in words."""
+
+    name: str
+    unit: str
+    value: float
+    half_width: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class _Maps:
+    flux_Wb: np.ndarray
+    flux_deviation: np.ndarray
+    torque_Nm: np.ndarray
+    torque_deviation: np.ndarray
+
+
+@dataclass(frozen=True)
+class Result:
+    """flux_Wb, torque_Nm: on angles and currents of the map; ..._deviation: standard deviations there."""
+
+    found: Findings
+    fit: Fit
+    shaft: Shaft
+    rows: electrical.Rows
+    log: np.ndarray
+    limit_A: float
+    supply_V: float
+    angle_rad: np.ndarray
+    current_A: np.ndarray
+    flux_Wb: np.ndarray
+    flux_deviation: np.ndarray
+    torque_Nm: np.ndarray
+    torque_deviation: np.ndarray
+    corrected_Wb: float
+    quantities: Sequence[Quantity]
+    warnings: Sequence[str]
+
+
+def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = SAMPLES) -> Result:
+    """The machine by the experiments. IdentifyError: they do not determine it."""
+    pulses = [pulse for pulse in found.pulses if pulse.log["time_us"][-1] <= found.mapped_us]
+    phases, largest_A = len(found.phases), electrical.common_current_A(pulses)
+    rows = electrical.within(electrical.rows_of(found, pulses), largest_A)
+    fit = electrical.solve(rows, phases, found.rotor_poles, largest_A)
+    others = electrical.resampled(rows, phases, fit, samples)
+    shaft = shaft_of(found, fit, log)
+    angle, current = np.meshgrid(np.linspace(0.0, math.pi / found.rotor_poles, MAP_ANGLES),
+                                 np.linspace(0.0, largest_A, MAP_CURRENTS + 1)[1:], indexing="ij")
+    raw, torque = fit.flux_Wb(angle, current), fit.torque_Nm(angle, current)
+    flux = rising(raw)
+    flux_deviation = np.std([other.flux_Wb(angle, current) for other in others], axis=0)
+    torque_deviation = np.std([other.torque_Nm(angle, current) for other in others], axis=0)
+    quiet = log[log["time_us"] < log["time_us"][0] + 20_000]
+    maps = _Maps(flux, flux_deviation, torque, torque_deviation)
+    return Result(found, fit, shaft, rows, log, limit_A, float(np.median(quiet["dc_link_V"])), angle, current, flux,
+                  flux_deviation, torque, torque_deviation, float(np.abs(flux - raw).max()),
+                  _quantities(found, fit, others, shaft, maps),
+                  _warnings(found, fit))
+
+
+def rising(flux_Wb: np.ndarray) -> np.ndarray:
+    """The map nearest to a map in its points that falls from aligned to unaligned and rises with the current, as far as
+    means of what contradicts it and of its neighbours go: the mean of the upper and the lower monotonic envelope."""
+    least = _REST_FLUX * float(flux_Wb.max())
+    ramp = least * np.arange(1, flux_Wb.shape[1] + 1)
+
+    def monotonic(of: np.ndarray, axis: int) -> np.ndarray:
+        upper = np.maximum.accumulate(of, axis=axis)
+        lower = np.flip(np.minimum.accumulate(np.flip(of, axis), axis=axis), axis)
+        return np.asarray((upper + lower) / 2.0)
+
+    inner = np.maximum(flux_Wb, ramp) - ramp
+    for _ in range(8):
+        inner = monotonic(monotonic(inner, 1)[::-1], 0)[::-1]
+    return np.asarray(inner + ramp)
+
+
+def _verdict(half_width: float, bound: float) -> str:
+    return "determined" if half_width <= bound else "uncertain"
+
+
+def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, maps: _Maps) -> list[Quantity]:
+    flux, torque = maps.flux_Wb, maps.torque_Nm
+    flux_deviation, torque_deviation = maps.flux_deviation, maps.torque_deviation
+
+    def half(values: Any) -> float:
+        return _INTERVAL * float(np.std(list(values)))
+
+    resistance = half(other.resistance_ohm for other in others)
+    inertia = math.hypot(_INTERVAL * shaft.inertia[1], _MODEL_PART * shaft.inertia[0])
+    friction = math.hypot(_INTERVAL * shaft.friction[1], _MODEL_PART * shaft.friction[0])
+    angle_deg = max(half(math.degrees(other.delta_rad[row]) for other in others) for row in range(len(found.phases)))
+    aligned_deg = math.degrees(2.0 * math.pi * found.position[found.phases[0]] + fit.delta_rad[0])
+    largest, strongest = float(flux.max()), float(np.abs(torque).max())
+    rms = _INTERVAL * float(np.sqrt(np.mean(flux_deviation**2))) / largest
+    torque_rms = _INTERVAL * float(np.sqrt(np.mean(torque_deviation**2))) / strongest
+    eccentricity = math.degrees(math.hypot(*fit.eccentricity_rad))
+    return [
+        Quantity("largest flux linkage", "Wb", largest, rms * largest, _verdict(rms, _FLAT_FLUX)),
+        Quantity("largest torque of a phase", "N m", strongest, torque_rms * strongest,
+                 _verdict(torque_rms, 4.0 * _FLAT_FLUX)),
+        Quantity("resistance of winding and devices", "ohm", fit.resistance_ohm, resistance,
+                 _verdict(resistance / fit.resistance_ohm, _FLAT_RESISTANCE)),
+        Quantity("mean drop of a device", "V", fit.drop_V, half(other.drop_V for other in others), "determined"),
+        Quantity("encoder at the aligned position of phase a", "deg", aligned_deg % (360.0 / found.rotor_poles),
+                 angle_deg, _verdict(angle_deg, _FLAT_ANGLE_DEG)),
+        Quantity("eccentricity of the encoder", "deg", eccentricity,
+                 half(math.degrees(math.hypot(*other.eccentricity_rad)) for other in others), "determined"),
+        Quantity("delay of the current sensors", "us", 1e6 * fit.delay_s, half(1e6 * other.delay_s for other in others),
+                 "determined"),
+        Quantity("inertia", "kg m^2", shaft.inertia[0], inertia, _verdict(inertia / shaft.inertia[0], _FLAT_INERTIA)),
+        Quantity("viscous friction", "N m s", shaft.friction[0], friction,
+                 _verdict(friction / max(abs(shaft.friction[0]), 1e-12), 0.1)),
+        Quantity("Coulomb friction", "N m", shaft.coulomb[0], _INTERVAL * shaft.coulomb[1],
+                 "no key of a machine file" if shaft.coulomb[0] else "within its uncertainty"),
+        Quantity("constant load", "N m", shaft.load[0], _INTERVAL * shaft.load[1],
+                 "no key of a machine file" if shaft.load[0] else "within its uncertainty"),
+    ]
+
+
+def _warnings(found: Findings, fit: Fit) -> list[str]:
+    """What keeps the drive from running on the file, a line each."""
+    lines = []
+    order = [found.order[phase] for phase in found.phases]
+    if order != list(range(len(order))):
+        reverse = order == [-k % len(order) for k in range(len(order))]
+        names = ", ".join(f"{'abcdef'[phase]} is {'abcdef'[found.order[phase]]}" for phase in found.phases
+                          if found.order[phase] != found.phases.index(phase))
+        lines.append("the encoder counts against the order of the phases: exchange two phases, or its direction"
+                     if reverse else f"the phases are wired in another order: {names}")
+    aligned = math.remainder(math.degrees(2.0 * math.pi * found.position[found.phases[0]] + fit.delta_rad[0]),
+                             360.0 / found.rotor_poles)
+    if abs(aligned) > 0.5:
+        lines.append(f"the encoder reads {aligned:+.3f} degrees where phase a is aligned: set its zero there; the "
+                     "drive has no parameter for it")
+    return lines
+
+
+# --- the machine file ------------------------------------------------------------------------------------------------
+
+def write_machine(result: Result, plate: Path, path: Path) -> Machine:
+    """Writes the machine file with its map beside it: motor by the result, board and ratings by the name plate's file.
+    Returns it as the loader reads it. IdentifyError: the loader refuses it, by its reason."""
+    machine = load_machine(plate)
+    data = scaling_of(plate, machine).data
+    board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
+    text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine, board, path)
+    table = path.with_suffix(".csv")
+    lines = ["# measured by the drive: tools/salient identify", "angle_deg,current_A,flux_linkage_Wb"]
+    angle, current, flux = _to_limit(result)
+    lines += [f"{math.degrees(each[0]):.9g},{each[1]:.9g},{each[2]:.9g}" for each in
+              zip(angle.ravel(), current.ravel(), flux.ravel(), strict=True)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # both files come into their place whole, or none does
+        staged = Path(folder) / path.name
+        staged.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        staged.write_text(text, encoding="utf-8")
+        try:
+            load_machine(staged)
+            scaling_of(path, load_machine(staged))
+        except MachineError as error:
+            reason = str(error).removeprefix(f"{staged}: ")
+            raise IdentifyError(f"the measured machine is refused: {reason}") from None
+        staged.with_suffix(".csv").replace(table)
+        staged.replace(path)
+    return load_machine(path)
+
+
+def _peak_A(result: Result) -> float:
+    largest_A = float(result.current_A[0, -1])
+    return result.limit_A if largest_A >= _NEAR_LIMIT * result.limit_A else largest_A
+
+
+def _to_limit(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angles, currents, flux linkages of the map; the little from the largest current of the pulses to the limit with
+    the last slope."""
+    angle, current, flux = result.angle_rad, result.current_A, result.flux_Wb
+    largest_A = float(current[0, -1])
+    if not _NEAR_LIMIT * result.limit_A <= largest_A < result.limit_A:
+        return angle, current, flux
+    slope = (flux[:, -1] - flux[:, -3]) / (current[:, -1] - current[:, -3])
+    more = flux[:, -1] + slope * (result.limit_A - largest_A)
+    return (np.hstack([angle, angle[:, -1:]]), np.hstack([current, np.full((len(current), 1), result.limit_A)]),
+            np.hstack([flux, more[:, None]]))
+
+
+def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:
+    fit, shaft = result.fit, result.shaft
+    converter = dict(plate.get("converter", {}))
+    of_devices = sum(machine.converter.get(name, 0.0) for name in ("switch_resistance_ohm", "diode_resistance_ohm"))
+    if not any(name in converter for name in ("switch_drop_V", "diode_drop_V")) and fit.drop_V > 0.0:
+        converter |= {"switch_drop_V": round(fit.drop_V, 4), "diode_drop_V": round(fit.drop_V, 4)}
+    converter["supply_voltage_V"] = round(result.supply_V, 1)
+    drive = {name: value for name, value in plate.get("drive", {}).items() if name != "parameters"}
+    drive |= {**board, "current_peak_A": float(f"{_peak_A(result):.6g}")}
+    resistance = fit.resistance_ohm - of_devices
+    if resistance <= 0.0:
+        raise IdentifyError(f"resistance {fit.resistance_ohm:.4g} ohm: less than that of the devices, {of_devices:.4g}")
+    tables: dict[str, Mapping[str, Any]] = {
+        "poles": plate["poles"],
+        "winding": {"resistance_ohm": float(f"{resistance:.6g}")},
+        "mechanics": {"inertia_kg_m2": float(f"{shaft.inertia[0]:.6g}"),
+                      "friction_Nm_s": float(f"{max(shaft.friction[0], 0.0):.6g}")},
+        "magnetics": {"form": "map", "file": path.with_suffix(".csv").name},
+        "converter": converter,
+        **{name: plate[name] for name in ("dc_link", "thermal") if name in plate},
+        "drive": drive,
+    }
+    if plate.get("drive", {}).get("parameters"):
+        tables["drive.parameters"] = plate["drive"]["parameters"]
+    return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
+                        path.stem, tables)
+
+
+def machine_text(about: str, name: str, tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """Text of a machine file. about: a comment at its top; tables: keys by the names of their tables."""
+    checked = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name)
+    lines = [f"# {about}", f'name = "{checked}"']
+    for title, keys in tables.items():
+        lines += ["", f"[{title}]", *(f"{key} = {_toml(value)}" for key, value in keys.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
