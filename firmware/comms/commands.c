@@ -207,8 +207,8 @@ static bool may_follow(const commands_t *commands, command_request_t request) {
 static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
-    const bool longer = frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID ||
-                        frame->identifier == DRIVE_IDENTIFY_COMMAND_FRAME_ID;
+    const bool experiments = frame->identifier == DRIVE_IDENTIFY_COMMAND_FRAME_ID;
+    const bool longer = experiments || frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID;
     if (frame->length != (longer ? DRIVE_POSITION_COMMAND_LENGTH : DRIVE_COMMAND_LENGTH)) {
         return reject_command(commands, &counters->wrong_length);
     }
@@ -219,7 +219,7 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
     commands->last_received_us = time_us;
     command_t requested = commands->requested;
     identify_command_t experiment = commands->identify;
-    if (!(identify || frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID
+    if (!(experiments || frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID
               ? unpack_identify(frame, &experiment, &requested)
               : unpack(frame, &requested)) ||
         !may_follow(commands, requested.request)) {
