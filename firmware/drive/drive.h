@@ -82,8 +82,6 @@ typedef struct {
     /* Written by the control interrupt. Last because it is large: loads and stores reach a limited offset in one
      * instruction. */
     fault_trace_t trace;
-    /* Written by the context of its event, and by the background while it has none. */
-    sampler_t sampler;
     /* Written by the control interrupt, its member `command` by the background with the interrupts masked. */
     identify_t identify;
 } drive_t;
