@@ -221,7 +221,7 @@ def measure_standstill(machine: str, encoder_bits: int, duration_s: float) -> fl
         bench.run_for(duration_s)
         bench.close()
         time_s, angle_deg = _angle(recording)
-    return float(np.ptp(angle_deg[time_s > 0.5])) / (360 / 2**encoder_bits)
+    return float(np.ptp(angle_deg[time_s > 0.5]) * 2.0**encoder_bits / 360)
 
 
 # --- page -------------------------------------------------------------------------------------------------------------
