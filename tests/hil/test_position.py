@@ -1,4 +1,4 @@
-"""Position mode: moves, holding, cyclic positions, homing, end stops, following error, lost commands, hostile frames."""
+"""Position mode: moves, holding, cyclic positions, homing, limits, following error, lost commands, hostile frames."""
 
 import math
 

@@ -13,7 +13,7 @@
 #define POSITION_ONE_REV (INT64_C(1) << 32)
 #define POSITION_MAX (POSITION_ONE_REV << 13)
 
-/* What the drive does with a set point while it runs in position mode. */
+/* Use of a set point while the drive runs in position mode. */
 typedef enum {
     POSITION_ORDER_PROFILE, /* moves to the target by the profile; another target or limit re-plans the move */
     POSITION_ORDER_CYCLIC,  /* follows targets that come every 1 to 10 ms, interpolated */
@@ -47,18 +47,18 @@ typedef struct {
 
 /* Written by the deferred interrupt; the background reads it with the interrupts masked, or by an unmasked read. */
 typedef struct {
-    bool active;          /* the drive runs in position mode */
-    bool homed;           /* the zero is that of a homing since the start */
-    bool homing;          /* under way */
-    bool homing_failed;   /* the last one found nothing, or was interrupted */
-    bool in_position;     /* at the target of a profile that has ended, within position_window_deg */
-    bool reference_ended; /* the profile has arrived, CiA 402: the reference no longer moves */
-    bool following_error; /* beyond following_error_deg: the fault of that name, and a stop until it is latched */
-    bool limited;         /* the target is beyond a software end stop, and is the stop instead */
-    uint32_t sequence;    /* of the set point that the reference follows */
-    int64_t position;     /* 2^-32 rev, in every state and mode */
-    int64_t reference;    /* 2^-32 rev; position while not active */
-    int32_t error;        /* reference - position, 2^-32 rev, saturated */
+    bool active;                 /* the drive runs in position mode */
+    bool homed;                  /* the zero is that of a homing since the start */
+    bool homing;                 /* under way */
+    bool homing_failed;          /* the last one found nothing, or was interrupted */
+    bool in_position;            /* at the target of a profile that has ended, within position_window_deg */
+    bool reference_ended;        /* the profile has arrived, CiA 402: the reference no longer moves */
+    bool following_error;        /* it was beyond following_error_deg: stopped until a halt */
+    bool limited;                /* the target is beyond a software end stop, and is the stop instead */
+    uint32_t sequence;           /* of the set point that the reference follows */
+    int64_t position;            /* 2^-32 rev, in every state and mode */
+    int64_t reference;           /* 2^-32 rev; position while not active */
+    int32_t error;               /* reference - position, 2^-32 rev, saturated */
     int32_t speed_reference_q22; /* of the reference, rad/s, Q9.22 */
 } position_status_t;
 

@@ -12,7 +12,7 @@
 /* 1 / 36 by 2^36. */
 #define PER_36_Q36 1908874354u
 
-/* Distance from the target, and speed and acceleration, that are none: 2^-34 rev. */
+/* Distance from the target, speed and acceleration below which the reference is there: 2^-34 rev. */
 #define NOTHING (INT64_C(1) << 14)
 
 /* Furthest from the target, for which the deadbeat law is tried: 1/4 rev, so that its sums fit. */

@@ -115,8 +115,9 @@ class Experiment:
 
 
 class Drive(KnownAttributes):
-    """Commands a drive. Assigning speed_reference_rpm, torque_reference_Nm or position_deg requests run in speed, torque
-    or position mode; the command is sent immediately and then every COMMAND_PERIOD_NS as the session's time advances, until `silence`.
+    """Commands a drive. Assigning speed_reference_rpm, torque_reference_Nm or position_deg requests run in speed,
+    torque or position mode; the command is sent immediately and then every COMMAND_PERIOD_NS as the session's time
+    advances, until `silence`.
     Nothing is sent before the first request. A request to run arms a drive that is not armed, while time advances: the
     drive runs about a millisecond later. One that was disarmed by a fault stays so until the next request.
     OtherDatabase instead of a request to run when the drive's DBC is another

@@ -33,15 +33,15 @@ _RECORD_STEP_NS = 50_000
 _BEGIN_S = 0.08
 _HEAD = """# Position mode, measured
 
-Written by `build/venv/bin/python -m salient.experiments.position_figures`; do not edit. [Position control](../control/position.md)
-explains the mode. A count is 360 / 2^17 degrees. The encoder has 17 bits and the inertia is that of the parameter, where
-a table states nothing else.
+Written by `build/venv/bin/python -m salient.experiments.position_figures`; do not edit.
+[Position control](../control/position.md) explains the mode. A count is 360 / 2^17 degrees. The encoder has 17 bits and
+the inertia is that of the parameter, where a table states nothing else.
 """
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of a profile, in rad and s; the deceleration is the acceleration."""
+    """Limits of a profile, in rad and s; the deceleration is the acceleration."""
 
     speed: float
     acceleration: float
@@ -65,15 +65,15 @@ class Limits:
 
 
 def limits_of(machine: str) -> Limits:
-    """Six tenths of the largest torque on the true inertia, reached in 5 ms, and half of over_speed_rpm: what a user who
-    knows the machine sets."""
+    """Six tenths of the largest torque on the true inertia, reached in 5 ms, and half of over_speed_rpm: limits of a
+    user who knows the machine."""
     parameters = derive(load_machine(machine_path(machine))).parameters
     acceleration = 0.6 * parameters["torque_max_Nm"] / parameters["inertia_kg_m2"]
     return Limits(parameters["over_speed_rpm"] / 2 * math.pi / 30, acceleration, acceleration / 0.005)
 
 
 def _parameters(machine: str, limits: Limits, ratio: float = 1.0) -> dict[str, float]:
-    """Of the drive; ratio: true inertia by that of the parameter."""
+    """Parameters of the drive; ratio: true inertia by that of the parameter."""
     inertia = derive(load_machine(machine_path(machine))).parameters["inertia_kg_m2"]
     rpm = 30 / math.pi
     return {"inertia_kg_m2": inertia / ratio, "position_speed_rpm": round(limits.speed * rpm),
@@ -108,8 +108,8 @@ def _angle(recording: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Move:
-    """Of the true angle: overshoot and time until it stays within two counts; the least time; the range in the last
-    100 ms, in counts."""
+    """Overshoot of the true angle and time until it stays within two counts; the least time; the range in the last 100
+    ms, in counts."""
 
     overshoot: float
     settling_s: float
@@ -179,15 +179,16 @@ def measure_hold(machine: str, part: float, encoder_bits: int = 17) -> Hold:
 
 
 def _rise_s(machine: str) -> float:
-    """Of the current to its limit, where the inductance is least."""
+    """Rise of the current to its limit, where the inductance is least."""
     read = load_machine(machine_path(machine))
     data = derive(read)
-    return data.parameters["current_limit_A"] * read.magnetics.unaligned_inductance_H / read.supply_voltage_V
+    return float(data.parameters["current_limit_A"] * read.magnetics.unaligned_inductance_H / read.supply_voltage_V)
 
 
 def measure_sine(machine: str, frequency_Hz: float, cycle_ms: int) -> tuple[float, float, float, float]:
     """Amplitude and largest following error in degrees, delay of the rotor behind the sine in ms, and its largest
-    deviation from the sine with that delay in degrees; a quarter of the largest torque, at most an eighth of over_speed_rpm."""
+    deviation from the sine with that delay in degrees; a quarter of the largest torque, at most an eighth of
+    over_speed_rpm."""
     parameters = derive(load_machine(machine_path(machine))).parameters
     rate = 2 * math.pi * frequency_Hz
     acceleration = parameters["torque_max_Nm"] / 4 / parameters["inertia_kg_m2"]
@@ -212,15 +213,15 @@ def measure_sine(machine: str, frequency_Hz: float, cycle_ms: int) -> tuple[floa
 
 
 def measure_standstill(machine: str, encoder_bits: int, duration_s: float) -> float:
-    """Range of the angle, in counts of the encoder, under a load of a quarter of the largest torque, after the first half
-    second."""
+    """Range of the angle, in counts of the encoder, under a load of a quarter of the largest torque, after the first
+    half second."""
     torque_max_Nm = derive(load_machine(machine_path(machine))).parameters["torque_max_Nm"]
     with _holding(machine, {}, encoder_bits=encoder_bits) as (bench, recording):
         bench.load_torque_Nm = torque_max_Nm / 4
         bench.run_for(duration_s)
         bench.close()
         time_s, angle_deg = _angle(recording)
-    return float(np.ptp(angle_deg[time_s > 0.5])) / (360 / 2**encoder_bits)
+    return float(np.ptp(angle_deg[time_s > 0.5]) * 2.0**encoder_bits / 360)
 
 
 # --- page -------------------------------------------------------------------------------------------------------------
@@ -235,8 +236,9 @@ def _name(machine: str) -> str:
 
 
 def _move_row(first: str, way_deg: float, move: Move) -> str:
-    return (f"| {first} | {way_deg:g} | {move.overshoot:.1f} | {move.settling_s * 1e3:.1f} | {move.least_s * 1e3:.1f} | "
-            f"{(move.settling_s - 0.005) / move.least_s:.2f} | {move.held:.1f} | {move.fault} |")
+    return (f"| {first} | {way_deg:g} | {move.overshoot:.1f} | {move.settling_s * 1e3:.1f} | "
+            f"{move.least_s * 1e3:.1f} | {(move.settling_s - 0.005) / move.least_s:.2f} | {move.held:.1f} | "
+            f"{move.fault} |")
 
 
 _MOVE_HEADS = ("way, deg | overshoot, counts | settled, ms | least, ms | (settled - 5 ms) by least | held, counts | "
@@ -264,8 +266,8 @@ def encoders(machine: str) -> str:
         rows.append(f"| {bits} | {move.overshoot * 2.0**(bits - 17):.2f} | {move.settling_s * 1e3:.1f} | "
                     f"{measure_standstill(machine, bits, 5.0):.2f} |")
     return _table(f"Encoders, {_name(machine)}, 90 degrees",
-                  "bits | overshoot, counts of the encoder | within two counts of 17 bits, ms | 5 s at standstill under a "
-                  "quarter of torque_max_Nm, counts of the encoder", rows)
+                  "bits | overshoot, counts of the encoder | within two counts of 17 bits, ms | 5 s at standstill "
+                  "under a quarter of torque_max_Nm, counts of the encoder", rows)
 
 
 def holding(machines: tuple[str, ...]) -> str:
@@ -279,9 +281,10 @@ def holding(machines: tuple[str, ...]) -> str:
                         f"{hold.after:.2f} |")
     minute = measure_standstill(machines[0], 17, 60.0)
     text = _table("Holding under a step of the load",
-                  "machine | step, of torque_max_Nm | deviation, counts | bound | by bound | back within 1.5 counts, ms | "
-                  "range before | range after", rows)
-    return text + f"\n60 s at standstill under a quarter of torque_max_Nm, {_name(machines[0])}: a range of {minute:.2f} counts.\n"
+                  "machine | step, of torque_max_Nm | deviation, counts | bound | by bound | "
+                  "back within 1.5 counts, ms | range before | range after", rows)
+    return text + (f"\n60 s at standstill under a quarter of torque_max_Nm, {_name(machines[0])}: a range of "
+                   f"{minute:.2f} counts.\n")
 
 
 def sines(machine: str) -> str:
@@ -290,17 +293,19 @@ def sines(machine: str) -> str:
     for frequency_Hz in (1.0, 5.0, 10.0, 20.0):
         for cycle_ms in (1, 4, 10):
             amplitude, error, delay_ms, deviation = measure_sine(machine, frequency_Hz, cycle_ms)
-            rows.append(f"| {frequency_Hz:g} | {cycle_ms} | {amplitude:.2f} | {error:.4f} | {delay_ms:.2f} | {deviation:.4f} |")
+            rows.append(f"| {frequency_Hz:g} | {cycle_ms} | {amplitude:.2f} | {error:.4f} | {delay_ms:.2f} | "
+                        f"{deviation:.4f} |")
     return _table(f"Cyclic sines, {_name(machine)}",
-                  "Hz | cycle, ms | amplitude, deg | following error, deg | delay, ms | from the delayed sine, deg", rows)
+                  "Hz | cycle, ms | amplitude, deg | following error, deg | delay, ms | from the delayed sine, deg",
+                  rows)
 
 
 def main() -> int:
     """Writes the page; returns the exit code."""
     machines = tuple(sys.argv[1:]) or MACHINES
     parts: list[Callable[[], str]] = [
-        lambda: moves(machines), lambda: inertias(machines[0]), lambda: encoders(machines[0]), lambda: holding(machines),
-        lambda: sines(machines[0])]
+        lambda: moves(machines), lambda: inertias(machines[0]), lambda: encoders(machines[0]),
+        lambda: holding(machines), lambda: sines(machines[0])]
     page = "\n".join([_HEAD, *(part() for part in parts)])
     if machines == MACHINES:
         PAGE.write_text(page.rstrip() + "\n", encoding="utf-8")

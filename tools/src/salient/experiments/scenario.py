@@ -305,7 +305,7 @@ def summary(result: RunResult) -> dict[str, Any]:
 
 
 def _position_summary(result: RunResult) -> dict[str, Any]:
-    """Of the telemetry: the last position, the largest following error, and the state at the end."""
+    """Telemetry of a position: the last one, the largest following error, and the state at the end."""
     errors_deg = np.abs(np.asarray(result.telemetry["DRIVE_POSITION.following_error_deg"].value, dtype=float))
     return {
         "final_deg": result.telemetry["DRIVE_POSITION.position_deg"].last,
