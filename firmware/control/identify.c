@@ -4,14 +4,14 @@
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
 
-/* Currents below this part of the limit are none. */
+/* Current of this part of the limit counts as no current. */
 #define NONE_SHIFT 7
 #define REST_PERIODS 4u
 /* Records of a pulse: after that part of the limit, or so many periods. */
 #define RECORD_SHIFT 5
 #define PULSE_SPACING 16u
 #define MARK_PERIODS 32u
-/* Of a hold: the error of the current is removed in so many periods, at most at a quarter of full voltage. */
+/* A hold: the error of the current is removed in so many periods, at most at a quarter of full voltage. */
 #define HOLD_SHIFT 2
 #define HOLD_DUTY_MAX_Q15 (MODULATOR_DUTY_ONE_Q15 / 4)
 /* Its largest current, part of the limit. */
@@ -114,7 +114,7 @@ static int32_t hold_duty_q15(const identify_parameters_t *parameters, const iden
                                      HOLD_DUTY_MAX_Q15);
 }
 
-/* What the last period made of the current, when that was one at full voltage. */
+/* Effect of the last period on the current, when that was one at full voltage. */
 static void follow_rise(identify_t *identify, int32_t current_q9) {
     if (identify->acted != IDENTIFY_ON) {
         return;
@@ -146,11 +146,34 @@ static bool in_window(const identify_command_t *command, uint32_t angle) {
            (angle >> 16) + 0x10000u - command->angle_q16 < command->width_q16;
 }
 
+/* The next action while the current rises; IDENTIFY_OFF when that ends. */
+static identify_action_t charge(const identify_parameters_t *parameters, const identify_t *identify,
+                                int32_t current_q9) {
+    const identify_command_t *command = &identify->command;
+    const int32_t level_q9 = (parameters->limit_q9 * command->level_q12) >> 12;
+    const bool unknown = identify->rise_q9 == 0 && identify->first_rise_q9[command->phase] == 0;
+    if (may_charge(identify, current_q9, level_q9) &&
+        identify->periods < IDENTIFY_CHARGE_MS * parameters->periods_per_ms) {
+        return IDENTIFY_ON;
+    }
+    return unknown && identify->periods < REST_PERIODS ? IDENTIFY_ZERO : IDENTIFY_OFF;
+}
+
+/* Its end: no current, and then a rest of some periods. */
+static void end_pulse(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
+    if (identify->state == IDENTIFY_DISCHARGES && identify->periods > 1u &&
+        current_q9 <= parameters->limit_q9 >> NONE_SHIFT) {
+        enter(identify, IDENTIFY_RESTS);
+    }
+    if (identify->state == IDENTIFY_RESTS && identify->periods >= REST_PERIODS) {
+        enter(identify, IDENTIFY_IDLE);
+    }
+}
+
 /* The state of a pulse from this sample on, and its action from the next one on. */
 static identify_action_t pulse(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
     const identify_command_t *command = &identify->command;
     const uint32_t time = command->time_ms * parameters->periods_per_ms;
-    const int32_t level_q9 = (parameters->limit_q9 * command->level_q12) >> 12;
     if (identify->state == IDENTIFY_WAITS) {
         if (current_q9 > parameters->limit_q9 >> NONE_SHIFT || !in_window(command, identify->angle)) {
             if (identify->periods > time) {
@@ -161,13 +184,9 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
         enter(identify, IDENTIFY_CHARGES);
     }
     if (identify->state == IDENTIFY_CHARGES) {
-        const bool unknown = identify->rise_q9 == 0 && identify->first_rise_q9[command->phase] == 0;
-        if (may_charge(identify, current_q9, level_q9) &&
-            identify->periods < IDENTIFY_CHARGE_MS * parameters->periods_per_ms) {
-            return IDENTIFY_ON;
-        }
-        if (unknown && identify->periods < REST_PERIODS) {
-            return IDENTIFY_ZERO;
+        const identify_action_t action = charge(parameters, identify, current_q9);
+        if (action != IDENTIFY_OFF) {
+            return action;
         }
         enter(identify, command->kind == IDENTIFY_KIND_FREEWHEEL ? IDENTIFY_FREEWHEELS : IDENTIFY_DISCHARGES);
     }
@@ -177,19 +196,13 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
         }
         enter(identify, IDENTIFY_DISCHARGES);
     }
-    if (identify->state == IDENTIFY_DISCHARGES && identify->periods > 1u &&
-        current_q9 <= parameters->limit_q9 >> NONE_SHIFT) {
-        enter(identify, IDENTIFY_RESTS);
-    }
-    if (identify->state == IDENTIFY_RESTS && identify->periods >= REST_PERIODS) {
-        enter(identify, IDENTIFY_IDLE);
-    }
+    end_pulse(parameters, identify, current_q9);
     return IDENTIFY_OFF;
 }
 
-/* Of a pulse the periods in which the switches or the state are others than in the period before, and where the current
- * has changed by a part of the limit since the last record: few enough for the bus, and none is missed by which the
- * voltage or its integral would be another one. */
+/* Records of a pulse are the periods in which the switches or the state are others than in the period before, and where
+ * the current has changed by a part of the limit since the last record: few enough for the bus, and none is missed by
+ * which the voltage or its integral would be another one. */
 static bool is_due(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
     const bool pulses = identify->state >= IDENTIFY_CHARGES && identify->state <= IDENTIFY_RESTS;
     const uint32_t spacing = pulses ? PULSE_SPACING : parameters->periods_per_ms;

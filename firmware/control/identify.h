@@ -20,7 +20,7 @@
 #include "drive_enumerations.h"
 #include "hal_pwm.h"
 
-/* Of an experiment, by the host. */
+/* An experiment, as the host asks for it. */
 typedef struct {
     identify_kind_t kind;
     uint8_t phase;      /* below the machine's number */
@@ -51,7 +51,7 @@ typedef enum {
     IDENTIFY_CONTROLLER /* another one than salient */
 } identify_limit_t;
 
-/* Of the phase of the experiment, in the period that begins with a sample. */
+/* Switches of the experiment's phase in the period that begins with a sample. */
 typedef enum { IDENTIFY_OFF, IDENTIFY_ZERO, IDENTIFY_ON, IDENTIFY_PART } identify_action_t;
 
 typedef struct {
@@ -66,7 +66,7 @@ typedef struct {
     uint32_t angle;            /* begin of the encoder's count, 2^-32 rev */
 } identify_sample_t;
 
-/* Of all 2^32 bits a flipped one leaves the limits as they are or ends the experiments. */
+/* State of the experiments. */
 typedef struct {
     identify_command_t command; /* written by the background with the interrupts masked */
     uint32_t record[2];         /* of the last period, below */

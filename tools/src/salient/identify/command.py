@@ -62,7 +62,7 @@ def identify(session: Session, plate: Machine, bins: int, repeats: int, print_li
 
 @contextmanager
 def _session(options: argparse.Namespace) -> Iterator[Session]:
-    """Of the drive on the bus, or of one that is simulated with another motor."""
+    """Session with the drive on the bus, or of one that is simulated with another motor."""
     if options.true_machine is None:
         for name in ("set", "encoder_bits", "seed"):
             if getattr(options, name):

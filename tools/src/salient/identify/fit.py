@@ -26,7 +26,7 @@ from salient.identify.sequence import Findings, Pulse
 ANGLES, CURRENTS = 48, 24
 _ITERATIONS = 5
 _ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
-"""Of the roughness, relative to the mean weight of a coefficient."""
+"""Weights of the roughness, relative to the mean weight of a coefficient."""
 _DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
 """Deviations of weak priors, for what a machine may not show."""
 _BEGIN_PART = 0.03
@@ -173,7 +173,7 @@ class _Problem:
 
 
 def _signs(basis: FluxBasis) -> sparse.csr_matrix:
-    """What no machine has negative, on a grid of both directions: the incremental inductance, scaled by the largest
+    """Quantities that no machine has negative, on a grid of both directions: the incremental inductance, scaled by the largest
     current, and the fall of the flux linkage from aligned to unaligned, by the pitch."""
     angle, current = np.meshgrid(np.linspace(0.0, math.pi / basis.rotor_poles, basis.angles + 1),
                                  np.linspace(0.0, basis.current_max_A, basis.columns), indexing="ij")

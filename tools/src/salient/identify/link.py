@@ -67,7 +67,7 @@ class Link:
 
     @property
     def time_s(self) -> float:
-        """Of the session."""
+        """Time of the session."""
         return self._session.time_s
 
     @property
@@ -200,5 +200,5 @@ def linked(session: Session) -> Iterator[Link]:
 
 
 def degrees(turn: float) -> float:
-    """Of revolutions."""
+    """Angle of revolutions."""
     return math.degrees(2.0 * math.pi * turn)

@@ -34,7 +34,7 @@ _FLAT_RESISTANCE, _FLAT_INERTIA, _FLAT_ANGLE_DEG, _FLAT_FLUX = 0.005, 0.02, 0.02
 _NEAR_LIMIT = 0.9
 """Largest current of the pulses, part of the limit, from which the map is continued to it; else it ends there."""
 _MODEL_PART = 0.0025
-"""What inertia and friction are wrong by without any noise, by the judge (salient.experiments.compare.identified)."""
+"""Part by which inertia and friction are wrong by without any noise, by the judge (salient.experiments.compare.identified)."""
 NOT_OBSERVABLE = (
     ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
      "pulses would be the same; by a meter in series"),
@@ -171,7 +171,7 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
 
 
 def _warnings(found: Findings, fit: Fit) -> list[str]:
-    """What keeps the drive from running on the file, a line each."""
+    """Reasons that keep the drive from running on the file, a line each."""
     lines = []
     order = [found.order[phase] for phase in found.phases]
     if order != list(range(len(order))):

@@ -28,7 +28,7 @@ _HOLD_S, _HOLD_MAX_S, _DAMPED_MAX = 0.15, 3.0, 12
 _FREEWHEEL_MS = 50
 _LATENCY_S = 2.5e-3
 _SLOWEST, _FASTEST = 0.7, 1.2
-"""Of the drift speed, between which it is kept."""
+"""Parts of the drift speed, between which it is kept."""
 _PATIENCE_S = 0.05
 """Wait for a window that is worth one pulse more of it."""
 _SPIN_UP_MAX_S, _COAST_S = 2.5, 1.0
@@ -45,7 +45,7 @@ class Pulse:
 
 @dataclass
 class Findings:
-    """Of the experiments. position: angle of the encoder at which a phase is aligned, rev, by phase; order: strokes by
+    """Results of the experiments. position: angle of the encoder at which a phase is aligned, rev, by phase; order: strokes by
     which it comes after phase a, in the direction in which the encoder counts; times in s of the link."""
 
     phases: list[int]

@@ -48,7 +48,7 @@ def torque_of(found: Findings, fit: Fit, log: np.ndarray) -> np.ndarray:
 
 
 def shaft_of(found: Findings, fit: Fit, log: np.ndarray) -> Shaft:
-    """Of the records after the alignment. IdentifyError: the rotor has not turned enough."""
+    """Inertia and friction by the records after the alignment. IdentifyError: the rotor has not turned enough."""
     log = log[log["time_us"] > found.wired_us]
     time_s = (log["time_us"] - log["time_us"][0]) * 1e-6
     angle = fit.shaft_rad(2.0 * math.pi * log["turn"])
