@@ -17,7 +17,7 @@ from salient.machine.eds import write_eds
 from salient.paths import ROOT
 
 PAGE = ROOT / "docs" / "can" / "canopen.md"
-_BLOCK = re.compile(r"(```text candump\n).*?(```\n)", re.DOTALL)
+_BLOCK = re.compile(r"(```text\n).*?(```\n)", re.DOTALL)
 _MEANINGS = {0x000: "NMT", 0x081: "EMCY", 0x701: "heartbeat, boot-up", 0x601: "SDO request", 0x581: "SDO response"}
 
 

@@ -127,7 +127,8 @@ def _bits(value: int) -> str:
 
 def source(dictionary: Dictionary) -> str:
     """canopen_dictionary.c."""
-    rows, strings = [], []
+    rows: list[str] = []
+    strings: list[str] = []
     for entry in dictionary.entries():
         value = f"CANOPEN_FROM_{entry.source}" if entry.source else f"CANOPEN_VALUE_{entry.value}" if entry.value else 0
         initial = entry.initial
