@@ -39,10 +39,10 @@
 typedef struct {
     /* Last accepted command; this and the next are written by the background with the interrupts masked. */
     command_t command;
-    control_parameters_t control_parameters;
     /* Written by the control interrupt, its member `deferred` by the deferred interrupt; the background prepares the
      * control laws for new parameters with the interrupts masked. */
     control_state_t control;
+    control_parameters_t control_parameters;
     hal_pwm_compare_t compare; /* of the last period in RUN; written by the control interrupt */
     uint32_t break_causes;     /* of the last control interrupt, HAL_PWM_BREAK_*; written by it */
     /* Execution time of the interrupts, for telemetry only; overruns are handled by monitors/protection.h. */

@@ -362,12 +362,16 @@ ALWAYS_INLINE void run_jobs(deferred_turn_t turn, const control_parameters_t *pa
 #undef JOB
 }
 
-NOINLINE static void take_turn(const control_parameters_t *parameters, deferred_t *deferred,
-                               const deferred_input_t *input, const int32_t flux_misalignment[HAL_PHASES_MAX]) {
+/* The position is followed in the shortest turn, which the budget of the interrupts does not feel. */
+NOINLINE static void take_turn(const control_parameters_t *parameters, control_state_t *state,
+                               const deferred_input_t *input) {
+    deferred_t *deferred = &state->deferred;
+    const int32_t *flux_misalignment = state->flux_misalignment;
     deferred->turn = (deferred->turn + 1) % DEFERRED_COMMON_PERIODS;
     switch (turns[deferred->turn]) {
     case TURN_LOAD:
         run_jobs(TURN_LOAD, parameters, deferred, input, flux_misalignment);
+        position_control_follow(state, input);
         break;
     case TURN_PHASE:
         run_jobs(TURN_PHASE, parameters, deferred, input, flux_misalignment);
@@ -420,6 +424,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         await_slow_counts(parameters, deferred, input, input->periods);
         slow_counts_update(&parameters->slow_counts, &deferred->slow_counts, 0);
         limit_currents(parameters, input, reset, results);
+        position_control_follow(state, input);
     } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
         if (deferred->slow_counts.slow) {
             learn_between_counts(parameters, deferred, input, state->flux_misalignment);
@@ -429,8 +434,9 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         }
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);
+        position_control_follow(state, input);
     } else if (!reset) { /* a step that resets has done enough */
-        take_turn(parameters, deferred, input, state->flux_misalignment);
+        take_turn(parameters, state, input);
     }
     if (parameters->torque_law == TORQUE_LAW_DUTY) {
         tune_pid(parameters, deferred, input, run_reset, results);

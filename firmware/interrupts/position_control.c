@@ -32,13 +32,14 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
     deferred->run = true;
     deferred->follows_position = true;
     deferred->accelerates = fixed_abs(output.torque_q24) >= parameters->conduction.torque_max_q24 / ACCELERATION_SHARE;
-    speed_control_deferred(parameters, deferred, input, &command, limit_q24, results);
+    speed_control_position(parameters, deferred, input, &command, limit_q24, results);
     results->speed.speed_law_torque_q24 =
         fixed_add(results->speed.speed_law_torque_q24, for_inertia_q24(deferred, output.torque_q24));
 }
 
-void position_control_deferred(const control_parameters_t *parameters, control_state_t *state,
-                               const deferred_input_t *input, const command_t *command, deferred_results_t *results) {
+/* Step of position mode: with its sample, which the other modes need not. */
+NOINLINE static void begin_step(const control_parameters_t *parameters, control_state_t *state,
+                                const deferred_input_t *input, deferred_results_t *results) {
     const int32_t limit_q24 =
         fixed_min(fixed_min(torque_limit_q24(parameters, state), state->deferred.conduction.torque_max_q24),
                   -state->deferred.conduction.torque_min_q24);
@@ -50,12 +51,24 @@ void position_control_deferred(const control_parameters_t *parameters, control_s
         .count = state->deferred.slow_counts.slow ? 2 * parameters->encoder_middle : 0,
         .periods = input->periods,
     };
-    if (input->run && command->mode == DRIVE_MODE_POSITION && command->request == COMMAND_RUN &&
+    position_status_t *status = &state->position.status;
+    status->active = status->active && state->deferred.follows_position; /* else it begins */
+    control_position(parameters, state, input, &sample, results);
+}
+
+void position_control_deferred(const control_parameters_t *parameters, control_state_t *state,
+                               const deferred_input_t *input, const command_t *command, deferred_results_t *results) {
+    if (command->mode == DRIVE_MODE_POSITION && input->run && command->request == COMMAND_RUN &&
         parameters->speed_reference_min_q22 < 0) {
-        control_position(parameters, state, input, &sample, results);
+        begin_step(parameters, state, input, results);
         return;
     }
     state->deferred.follows_position = false;
-    position_follow(&state->position, &sample);
     speed_control_deferred(parameters, &state->deferred, input, command, state->torque_limit_q24, results);
+}
+
+void position_control_follow(control_state_t *state, const deferred_input_t *input) {
+    if (!state->deferred.follows_position) {
+        position_follow(&state->position, input->encoder_angle, input->angle);
+    }
 }

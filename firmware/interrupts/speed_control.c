@@ -70,8 +70,9 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
     return fixed_add(torque_q24, offset_q24);
 }
 
-void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
-                            const command_t *command, int32_t limit_q24, deferred_results_t *results) {
+ALWAYS_INLINE void compute_law(const control_parameters_t *parameters, deferred_t *deferred,
+                               const deferred_input_t *input, const command_t *command, int32_t limit_q24,
+                               deferred_results_t *results) {
     const int32_t offset_q24 = torque_offset_q24(&deferred->torque_offset);
     int32_t min_q24 = deferred->conduction.torque_min_q24, max_q24 = deferred->conduction.torque_max_q24;
     min_q24 = fixed_max(min_q24, -limit_q24);
@@ -105,6 +106,19 @@ void speed_control_deferred(const control_parameters_t *parameters, deferred_t *
     results->speed.speed_law_torque_q24 = torque_q24;
     results->speed.torque_min_q24 = min_q24;
     results->speed.torque_max_q24 = max_q24;
+}
+
+void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                            const command_t *command, int32_t limit_q24, deferred_results_t *results) {
+    compute_law(parameters, deferred, input, command, limit_q24, results);
+}
+
+/* The same code again: one that is called from two places is not inlined, which would take instructions of the speed
+ * and torque modes. */
+NOINLINE void speed_control_position(const control_parameters_t *parameters, deferred_t *deferred,
+                                     const deferred_input_t *input, const command_t *command, int32_t limit_q24,
+                                     deferred_results_t *results) {
+    compute_law(parameters, deferred, input, command, limit_q24, results);
 }
 
 void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,

@@ -22,6 +22,10 @@ int32_t speed_control_limited_q22(const control_parameters_t *parameters, int32_
 void speed_control_deferred(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
                             const command_t *command, int32_t limit_q24, deferred_results_t *results);
 
+/* The same for the reference of a position loop, which is deferred->speed_reference_q22. [deferred interrupt] */
+void speed_control_position(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input,
+                            const command_t *command, int32_t limit_q24, deferred_results_t *results);
+
 /* While counts are slow, a speed above the reference may be one of the estimate alone. A load against the reference
  * brakes by itself: the more of it, the less braking torque, none from a sixteenth of the largest torque on. A load
  * that drives limits nothing. load_q24: estimated load torque, N m, Q7.24. For limits of speed mode.

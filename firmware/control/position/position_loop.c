@@ -20,29 +20,29 @@ static int64_t to_profile(int64_t position) {
 }
 
 /* 2^-32 rev, limited. */
-static int64_t present(const position_t *position, const position_sample_t *sample) {
-    const int64_t counted = position->counted + (int32_t)(sample->angle - sample->encoder_angle);
+static int64_t present(const position_t *position, uint32_t encoder_angle, uint32_t angle) {
+    const int64_t counted = position->counted + (int32_t)(angle - encoder_angle);
     return limited(counted - position->zero);
 }
 
-static void count(position_t *position, const position_sample_t *sample) {
+static void count(position_t *position, uint32_t encoder_angle, uint32_t angle) {
     if (!position->started) {
         position->started = true;
-        position->counted = sample->encoder_angle;
+        position->counted = encoder_angle;
     } else {
-        position->counted += (int32_t)(sample->encoder_angle - position->encoder_angle);
+        position->counted += (int32_t)(encoder_angle - position->encoder_angle);
     }
     if (position->counted - position->zero > POSITION_MAX || position->counted - position->zero < -POSITION_MAX) {
         position->zero = position->counted - (position->counted & (POSITION_ONE_REV - 1)); /* the range has ended */
         position->status.homed = false;
     }
-    position->encoder_angle = sample->encoder_angle;
-    position->status.position = present(position, sample);
+    position->encoder_angle = encoder_angle;
+    position->status.position = present(position, encoder_angle, angle);
 }
 
-void position_follow(position_t *position, const position_sample_t *sample) {
+void position_follow(position_t *position, uint32_t encoder_angle, uint32_t angle) {
     position_status_t *status = &position->status;
-    count(position, sample);
+    count(position, encoder_angle, angle);
     if (status->active && position->homing != POSITION_HOMING_IDLE) {
         status->homing_failed = true;
     }
@@ -343,7 +343,7 @@ static position_output_t output(const position_parameters_t *parameters, positio
 position_output_t position_step(const position_parameters_t *parameters, position_t *position,
                                 const position_command_t *command, const position_sample_t *sample) {
     position_status_t *status = &position->status;
-    count(position, sample);
+    count(position, sample->encoder_angle, sample->angle);
     if (!status->active) {
         status->active = true;
         begin_here(position, sample);

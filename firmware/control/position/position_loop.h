@@ -102,8 +102,9 @@ typedef struct {
     int32_t torque_q24; /* to accelerate the inertia of the parameter, N m, Q7.24, saturated */
 } position_output_t;
 
-/* Follows the position while the drive is not in position mode. [deferred interrupt] */
-void position_follow(position_t *position, const position_sample_t *sample);
+/* Follows the position while the drive is not in position mode. The rotor has turned by less than half a revolution
+ * since the last call of this or the next function. [deferred interrupt] */
+void position_follow(position_t *position, uint32_t encoder_angle, uint32_t angle);
 
 /* One step of position mode. [deferred interrupt] */
 position_output_t position_step(const position_parameters_t *parameters, position_t *position,

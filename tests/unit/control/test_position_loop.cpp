@@ -142,7 +142,7 @@ TEST_F(PositionLoop, is_followed_outside_of_position_mode_and_by_hand) {
     for (int k = 0; k < 2000; k++) {
         rotor_rev += 0.01;
         const position_sample_t now = sample();
-        position_follow(&position, &now);
+        position_follow(&position, now.encoder_angle, now.angle);
         ASSERT_NEAR(position_rev(), rotor_rev, 1e-6);
         ASSERT_FALSE(position.status.active);
         ASSERT_EQ(position.status.reference, position.status.position);
@@ -315,7 +315,7 @@ TEST_F(PositionLoop, a_homing_that_another_order_or_the_end_of_the_run_interrupt
     ticks(50);
     EXPECT_FALSE(position.status.homing_failed);
     const position_sample_t now = sample();
-    position_follow(&position, &now);
+    position_follow(&position, now.encoder_angle, now.angle);
     EXPECT_TRUE(position.status.homing_failed);
 }
 
@@ -342,14 +342,14 @@ TEST_F(PositionLoop, any_set_points_keep_the_limits_and_the_formats) {
 
 TEST_F(PositionLoop, the_end_of_the_range_of_positions_begins_a_new_one) {
     const position_sample_t now = sample();
-    position_follow(&position, &now);
+    position_follow(&position, now.encoder_angle, now.angle);
     position.counted = POSITION_MAX - 10;
     position.zero = 0;
     position.status.homed = true;
     for (int k = 0; k < 10; k++) {
         rotor_rev += 0.1;
         const position_sample_t next = sample();
-        position_follow(&position, &next);
+        position_follow(&position, next.encoder_angle, next.angle);
         ASSERT_LE(std::abs(position.status.position), POSITION_MAX);
     }
     EXPECT_FALSE(position.status.homed);

@@ -76,6 +76,7 @@ ParameterName = Literal[
     "inverter_limit_C",
     "degraded_running",
     "table_scale",
+    "protocol",
     "position_min_rev",
     "position_max_rev",
     "position_gain_1_s",
