@@ -251,7 +251,7 @@ static void follow_enabling(canopen_t *canopen, const canopen_context_t *context
     }
 }
 
-/* What follows by itself from the state of the drive. */
+/* Transitions that follow from the state of the drive alone. */
 static void follow_drive(canopen_t *canopen, const canopen_context_t *context) {
     canopen_drive_t *drive = &canopen->drive;
     const drive_state_t state = canopen->measured.state;

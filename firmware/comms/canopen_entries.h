@@ -43,7 +43,7 @@ uint32_t canopen_find(unsigned index, unsigned sub, canopen_object_t *object);
 /* Bytes of a number; 0 for texts and domains. */
 unsigned canopen_bytes(const canopen_object_t *object);
 
-/* The place of a variable in values[]; CANOPEN_VALUE_COUNT for an entry that is none. */
+/* The place of a variable in values[]; CANOPEN_VALUE_COUNT for any other entry. */
 unsigned canopen_slot(const canopen_object_t *object);
 
 /* A number from its bytes, low byte first, sign extended; and the reverse. */

@@ -1,5 +1,5 @@
 /* LSS slave (CiA 305): selection by switch or by identity, node-ID, its storage, identification. The bit rate is the
- * board's; the node-ID is never that of an unconfigured device, so that fast scan finds none. */
+ * board's; the node-ID is never an unconfigured device's, so that fast scan finds none. */
 #ifndef COMMS_CANOPEN_LSS_H
 #define COMMS_CANOPEN_LSS_H
 

@@ -10,7 +10,7 @@
 #define CANOPEN_PDO_SYNC_MAX 240 /* of a transmission type by SYNC */
 #define CANOPEN_MAPPED_MAX 8u
 
-/* COB-ID of a PDO; value: that of its object for the first one. */
+/* COB-ID of a PDO; value: its object's, for the first one. */
 static inline uint32_t canopen_mapping_id(const canopen_t *canopen, unsigned value, unsigned pdo) {
     return (uint32_t)canopen->values[value + pdo];
 }

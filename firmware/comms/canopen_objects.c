@@ -53,7 +53,7 @@ static int32_t error_field(const canopen_t *canopen, const canopen_context_t *co
     return (int32_t)(canopen_error_codes[fault.fault] | (uint32_t)fault.fault << 16);
 }
 
-/* Of parts of the drive. */
+/* Objects that parts of the drive own. */
 static int32_t read_drive(const canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object) {
     const canopen_measured_t *measured = &canopen->measured;
     switch (object->row.value) {

@@ -9,7 +9,7 @@
 
 #include "comms/canopen_objects.h"
 
-/* Takes a receive PDO, the first one of an identifier; false: it is that of none. */
+/* Takes a receive PDO, the first one of an identifier; false: no PDO has it. */
 bool canopen_pdo_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame);
 
 /* A SYNC has been received. */

@@ -1,4 +1,4 @@
-/* Units of the profile, by its factor groups, and those of the drive.
+/* Units of the profile, by its factor groups, and the drive's.
  *
  *   velocity      r/min of the motor = value * numerator / divisor * motor / shaft revolutions, objects 0x6096, 0x6091
  *   acceleration  likewise with 0x6097, a second

@@ -74,10 +74,9 @@ static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) 
     return reject(counter);
 }
 
-static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH &&
-                  DRIVE_COMMAND_LENGTH == DRIVE_IDENTIFY_WINDOW_LENGTH &&
-                  DRIVE_POSITION_COMMAND_LENGTH == DRIVE_IDENTIFY_COMMAND_LENGTH,
-              "one check of their length");
+static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH, "both commands have one check of their length");
+static_assert(DRIVE_COMMAND_LENGTH == (unsigned)DRIVE_IDENTIFY_WINDOW_LENGTH, "likewise");
+static_assert(DRIVE_POSITION_COMMAND_LENGTH == (unsigned)DRIVE_IDENTIFY_COMMAND_LENGTH, "likewise");
 
 /* Writes an experiment, of which the window comes before the rest. As unpack. */
 static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *identify, command_t *command) {

@@ -43,7 +43,7 @@ COLD void comms_bus_off(comms_t *comms) {
         commands_disarm(&comms->commands);
         return;
     }
-    comms->bus.run_inhibited = false; /* the reaction is that of the profile; it enables nothing by itself */
+    comms->bus.run_inhibited = false; /* the profile has the reaction; it enables nothing by itself */
     comms->canopen.bus_off = true;
 }
 

@@ -68,7 +68,7 @@ typedef struct {
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
 void comms_init(comms_t *comms, unsigned node, uint32_t time_us);
 
-/* Chooses the protocol, after comms_init. protocol: the parameter, 0 that of drive.dbc, else CANopen with this
+/* Chooses the protocol, after comms_init. protocol: the parameter, 0 for drive.dbc, else CANopen with this
  * node-ID. */
 void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us);
 

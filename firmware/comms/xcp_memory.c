@@ -6,8 +6,7 @@
 
 typedef enum { SCOPE_STOP, SCOPE_ARM, SCOPE_TRIGGER, SCOPE_COMMANDS } scope_command_t;
 
-static const char event_names[XCP_EVENTS][XCP_TEXT_BYTES] = {"control", "background", "deferred",
-                                                               "identify"};
+static const char event_names[XCP_EVENTS][XCP_TEXT_BYTES] = {"control", "background", "deferred", "identify"};
 
 static bool within(uint32_t offset, unsigned bytes, uint32_t area_bytes) {
     return offset < area_bytes && bytes <= area_bytes - offset;

@@ -18,7 +18,7 @@
 /* Time without a valid command after which a run ends in the fault command_timeout. */
 #define COMMAND_LOST_US 500000u
 
-/* Request to run experiments (control/identify.h), beside those of the bus. */
+/* Request to run experiments (control/identify.h), beside the requests of the bus. */
 #define COMMAND_IDENTIFY ((command_request_t)COMMAND_COUNT)
 
 /* True of the requests that a drive has to be armed for. */

@@ -261,8 +261,8 @@ static void average_torque(deferred_t *deferred, const deferred_input_t *input) 
     deferred->mean_torque_q24 += input->torque_sum_q24 >> 2;
 }
 
-/* A torque that is at its limit in order to change the speed follows no load, nor does that of a position reference
- * which accelerates. The next mean torque begins. */
+/* A torque that is at its limit in order to change the speed follows no load, nor does the torque of a
+ * position reference which accelerates. The next mean torque begins. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
     inertia_step(

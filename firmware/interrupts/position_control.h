@@ -4,9 +4,9 @@
 
 #include "interrupts/control_step.h"
 
-/* The speed and torque results of this step: in position mode those of the speed law with the reference of the position
- * loop, whose torque is added; otherwise speed_control_deferred(). The ramp of the speed reference is that of speed
- * mode alone; a controller of one quadrant holds a reference of 0. [deferred interrupt] */
+/* The speed and torque results of this step: in position mode the speed law's with the reference of the position
+ * loop, whose torque is added; otherwise speed_control_deferred(). Speed mode alone ramps
+ * the speed reference; a controller of one quadrant holds a reference of 0. [deferred interrupt] */
 void position_control_deferred(const control_parameters_t *parameters, control_state_t *state,
                                const deferred_input_t *input, const command_t *command, deferred_results_t *results);
 

@@ -269,7 +269,7 @@ def test_a_fault_is_an_emergency_and_an_entry_of_the_error_field(bench, tmp_path
 
 
 def test_two_masters_get_no_mixed_value_and_stop_nothing(bench, tmp_path):
-    """A second one writes another target, and starts transfers amid those of the first: each value is one of both."""
+    """A second one writes another target, and starts transfers amid the first one's: each value is one of both."""
     drawn = random.Random(1)
     with master(bench, tmp_path) as (network, node):
         enable(node)

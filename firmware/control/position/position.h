@@ -27,7 +27,7 @@ typedef enum {
     POSITION_HOMING_INDEX_BACKWARD, /* backwards */
     POSITION_HOMING_STOP_FORWARD,   /* a mechanical stop, found by its torque, forwards */
     POSITION_HOMING_STOP_BACKWARD,  /* backwards */
-    POSITION_HOMING_METHODS         /* of a set point: that of the parameter homing_method */
+    POSITION_HOMING_METHODS         /* of a set point: as the parameter homing_method has it */
 } position_homing_t;
 
 /* Written by the background with the interrupts masked. Values beyond their range are limited to it; a limit of 0 is
@@ -48,7 +48,7 @@ typedef struct {
 /* Written by the deferred interrupt; the background reads it with the interrupts masked, or by an unmasked read. */
 typedef struct {
     bool active;                 /* the drive runs in position mode */
-    bool homed;                  /* the zero is that of a homing since the start */
+    bool homed;                  /* a homing since the start has set the zero */
     bool homing;                 /* under way */
     bool homing_failed;          /* the last one found nothing, or was interrupted */
     bool in_position;            /* at the target of a profile that has ended, within position_window_deg */

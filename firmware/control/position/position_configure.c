@@ -4,7 +4,7 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 
-/* 2^48 rev / 60 s in ms, ms^2, ms^3: r/min, r/min/s, r/min/s^2 to those of a profile. */
+/* 2^48 rev / 60 s in ms, ms^2, ms^3: r/min, r/min/s, r/min/s^2 to a profile's units. */
 #define PER_RPM_Q8 INT64_C(1200959900633)
 #define PER_RPM_S INT64_C(4691250)
 #define PER_RPM_S2 INT64_C(4691)
@@ -52,7 +52,7 @@ COLD static profile_limits_t limits_from(const position_settings_t *settings) {
 COLD static void set_scales(const position_settings_t *settings, position_parameters_t *position) {
     const int64_t per_q16 = per_speed_q16(settings);
     const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
-    /* To speed: 2^16 / per_q16. To torque: the speed that an acceleration adds in a period, by that of an LSB. */
+    /* To speed: 2^16 / per_q16. To torque: the speed that an acceleration adds in a period, by an LSB's. */
     position->speed_of = profile_scale_of(INT64_C(1) << 16, per_q16);
     position->gain = profile_scale_of((int64_t)fixed_max(settings->gain_1_s, 1) << 16, per_q16 * PROFILE_TICK_HZ);
     position->torque_of =

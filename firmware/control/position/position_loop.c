@@ -301,7 +301,7 @@ COLD NOINLINE static void tick(const position_parameters_t *parameters, position
     profile->end = profile_advance(&profile->start, profile->q);
 }
 
-/* The limits of a homing are those of the order with its own speed. */
+/* The order's limits with the speed of a homing. */
 static profile_limits_t limits_of(const position_parameters_t *parameters, const position_t *position,
                                   const position_command_t *command) {
     profile_limits_t limits = command->limits;

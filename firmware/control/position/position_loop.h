@@ -6,8 +6,8 @@
  * reaching law J k (w* - w) this is the full-state law a = a_r + k (w_r - w) + k K (x_r - x), its poles at
  * (k +- sqrt(k^2 - 4 k K)) / 2: a cascade that is no less stiff (derived here).
  *
- * The position is that of the counts since the start, over any number of turns, and the observer's angle within them,
- * less the zero of the homing. It is followed in every state.
+ * The position is the sum of the counts since the start, over any number of turns, and the observer's angle within
+ * them, less the zero of the homing. It is followed in every state.
  *
  * Orders, decided in each tick of profile.h:
  *

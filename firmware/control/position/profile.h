@@ -14,7 +14,7 @@
  * the acceleration has no step. It is time-optimal but for the ticks, and for PROFILE_MARGIN of deceleration and jerk
  * that the plan leaves to make up for a switch within a tick.
  *
- * The last three ticks are those of a deadbeat law, the three jerks that bring a triple integrator to rest at the
+ * The last three ticks follow a deadbeat law, the three jerks that bring a triple integrator to rest at the
  * target exactly, as soon as they are within the limits.
  *
  * Units: positions 2^-48 rev, of the target; speeds 2^-48 rev per tick; accelerations 2^-48 rev per tick^2; q, a sixth

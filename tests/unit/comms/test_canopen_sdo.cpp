@@ -91,7 +91,7 @@ TEST_F(CanopenSdo, aborts_with_the_codes_of_the_standard) {
     EXPECT_EQ(sdo(head(0x23, 0x1010, 1, 1)), aborted(0x1010, 1, 0x08000020)) << "not the signature";
     EXPECT_EQ(sdo({0xE0, 0, 0, 0, 0, 0, 0, 0})[0], 0x80);
     EXPECT_EQ(word(sdo({0x60, 0, 0, 0, 0, 0, 0, 0})), 0x05040001u) << "a segment without a transfer";
-    EXPECT_EQ(sdo({0x40, 0x00, 0x10}), bytes_t{}) << "a short frame is none of SDO";
+    EXPECT_EQ(sdo({0x40, 0x00, 0x10}), bytes_t{}) << "a short frame is no SDO";
 }
 
 TEST_F(CanopenSdo, every_object_is_read_and_written_within_and_refused_beyond_its_limits) {

@@ -211,7 +211,7 @@ class BenchConfig(Conditions):
                         maximum=NODE_MAX, commands=("sim",))
     drives: int = _option(1, INTEGER, "drives on the bus, each on a bench of its own, with ascending node numbers",
                           metavar="N", minimum=1, maximum=NODE_MAX + 1, commands=("sim",))
-    protocol: str = _option("salient", WORD, "protocol on the bus at the start: that of drive.dbc, or CANopen with the "
+    protocol: str = _option("salient", WORD, "protocol on the bus at the start: drive.dbc, or CANopen with the "
                             "node-ID node + 1", metavar="NAME", choices=PROTOCOLS, commands=("sim",))
     telemetry_period_ms: int | None = _option(None, INTEGER, "period of the drive's fast telemetry at the start in ms; "
                                               "without it the default of the parameter", metavar="N", minimum=1,

@@ -30,7 +30,7 @@ def network_on(session: Session) -> Iterator[Any]:
     """A canopen.Network on the bus of a session that moves time."""
     import canopen  # not for those who have no such drive
 
-    class Network(canopen.Network):  # type: ignore[misc] - the package has no types for its base
+    class Network(canopen.Network):
         """Sends by the session, and hears what the session has heard."""
 
         def __init__(self) -> None:

@@ -35,7 +35,7 @@ _HEAD = """# Position mode, measured
 
 Written by `build/venv/bin/python -m salient.experiments.position_figures`; do not edit.
 [Position control](../control/position.md) explains the mode. A count is 360 / 2^17 degrees. The encoder has 17 bits and
-the inertia is that of the parameter, where a table states nothing else.
+the inertia is the parameter's, where a table states nothing else.
 """
 
 
@@ -73,7 +73,7 @@ def limits_of(machine: str) -> Limits:
 
 
 def _parameters(machine: str, limits: Limits, ratio: float = 1.0) -> dict[str, float]:
-    """Parameters of the drive; ratio: true inertia by that of the parameter."""
+    """Parameters of the drive; ratio: true inertia by the parameter's."""
     inertia = derive(load_machine(machine_path(machine))).parameters["inertia_kg_m2"]
     rpm = 30 / math.pi
     return {"inertia_kg_m2": inertia / ratio, "position_speed_rpm": round(limits.speed * rpm),
@@ -152,7 +152,7 @@ class Hold:
 
 
 def measure_hold(machine: str, part: float, encoder_bits: int = 17) -> Hold:
-    """A step of the load by a part of the largest torque. The bound is that of a drive which has its largest torque a
+    """A step of the load by a part of the largest torque. The bound holds for a drive which has its largest torque a
     delay after the step: that in which the load turns the rotor by a count, two control periods, and the rise of the
     current to its limit at the supply's voltage from the unaligned position, in half of which its torque is counted."""
     data = derive(load_machine(machine_path(machine)))
@@ -252,10 +252,10 @@ def moves(machines: tuple[str, ...]) -> str:
 
 
 def inertias(machine: str) -> str:
-    """Moves with another inertia than that of the parameter: the first one, and the third."""
+    """Moves with another inertia than the parameter's: the first one, and the third."""
     rows = [_move_row(f"{ratio:g} | {before + 1}.", way, measure_move(machine, way, ratio, before))
             for ratio in (0.3, 0.5, 2.0, 5.0) for way in (1.0, 90.0) for before in (0, 2)]
-    return _table(f"Inertia by that of the parameter, {_name(machine)}", f"inertia | move | {_MOVE_HEADS}", rows)
+    return _table(f"Inertia by the parameter's, {_name(machine)}", f"inertia | move | {_MOVE_HEADS}", rows)
 
 
 def encoders(machine: str) -> str:

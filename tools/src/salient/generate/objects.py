@@ -39,7 +39,7 @@ typedef enum {{
     CANOPEN_VALUE_COUNT = {value_count}
 }} canopen_value_t;
 
-/* What computes the value of an entry that is neither a variable nor a constant. */
+/* Functions that compute the value of an entry that is neither a variable nor a constant. */
 typedef enum {{
 {sources}
 }} canopen_from_t;

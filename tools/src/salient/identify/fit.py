@@ -7,7 +7,7 @@ so are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newt
 phase, the delay of the current sensors, their offsets, the eccentricity of the encoder.
 
 Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and
-what the drop of a switch differs from that of a diode.
+the difference of the drops of a switch and a diode.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
     if last <= first + 1:
         return None
     step_s = np.diff(log["time_us"][first:last + 1]) * 1e-6
-    sign = np.vectorize(_SIGN.get, otypes=[float])(log["action"][first:last])
+    sign = np.array([float(_SIGN[action]) for action in log["action"][first:last].tolist()])
     voltage = (log["dc_link_V"][first:last] + log["dc_link_V"][first + 1:last + 1]) / 2.0
     mean_A = (current[first:last] + current[first + 1:last + 1]) / 2.0
     flux, charge, time_s = np.cumsum(sign * voltage * step_s), np.cumsum(mean_A * step_s), np.cumsum(step_s)
@@ -133,7 +133,7 @@ class Fit:
         return self.basis.value(self.coefficients, angle_rad, current_A, 1, -1)
 
     def shaft_rad(self, encoder_rad: np.ndarray) -> np.ndarray:
-        """Angle of the shaft by that of the encoder."""
+        """Angle of the shaft by the encoder's."""
         cosine, sine = self.eccentricity_rad
         return np.asarray(encoder_rad - cosine * np.cos(encoder_rad) - sine * np.sin(encoder_rad))
 
@@ -173,8 +173,8 @@ class _Problem:
 
 
 def _signs(basis: FluxBasis) -> sparse.csr_matrix:
-    """Quantities that no machine has negative, on a grid of both directions: the incremental inductance, scaled by the largest
-    current, and the fall of the flux linkage from aligned to unaligned, by the pitch."""
+    """Quantities that no machine has negative, on a grid of both directions: the incremental inductance, scaled by the
+    largest current, and the fall of the flux linkage from aligned to unaligned, by the pitch."""
     angle, current = np.meshgrid(np.linspace(0.0, math.pi / basis.rotor_poles, basis.angles + 1),
                                  np.linspace(0.0, basis.current_max_A, basis.columns), indexing="ij")
     rises = basis.design(angle.ravel(), current.ravel(), 0, 1) * basis.current_max_A
@@ -230,7 +230,7 @@ def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | 
 
 
 def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
-    """The solution whose signs are those of a machine: those that are not are drawn to their least value, with the
+    """The solution with the signs of a machine: others are drawn to their least value, with the
     rest of the map. IdentifyError: there is none."""
     signs, least = problem.signs, problem.least
     weight = _SIGN_WEIGHT * float(np.trace(normal[:n, :n])) / float(signs.multiply(signs).sum())
@@ -253,7 +253,7 @@ def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: in
 
 
 def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:
-    """The fit of pulses drawn with repetition, once in each sample: its scatter is that of the result, whatever
+    """The fit of pulses drawn with repetition, once in each sample: it scatters as the result does, whatever
     correlates the rows of a pulse."""
     problem = _problem(rows, phases, fit, fit.basis.roughness(), linear=False)
     random = np.random.default_rng(seed)

@@ -34,7 +34,7 @@ _FLAT_RESISTANCE, _FLAT_INERTIA, _FLAT_ANGLE_DEG, _FLAT_FLUX = 0.005, 0.02, 0.02
 _NEAR_LIMIT = 0.9
 """Largest current of the pulses, part of the limit, from which the map is continued to it; else it ends there."""
 _MODEL_PART = 0.0025
-"""Part by which inertia and friction are wrong by without any noise, by the judge (salient.experiments.compare.identified)."""
+"""Part by which inertia and friction are wrong without any noise (salient.experiments.identified); cause not known."""
 NOT_OBSERVABLE = (
     ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
      "pulses would be the same; by a meter in series"),

@@ -45,8 +45,8 @@ class Pulse:
 
 @dataclass
 class Findings:
-    """Results of the experiments. position: angle of the encoder at which a phase is aligned, rev, by phase; order: strokes by
-    which it comes after phase a, in the direction in which the encoder counts; times in s of the link."""
+    """Results of the experiments. position: angle of the encoder at which a phase is aligned, rev, by phase; order:
+    strokes by which it comes after phase a, in the direction in which the encoder counts; times in s of the link."""
 
     phases: list[int]
     rotor_poles: int

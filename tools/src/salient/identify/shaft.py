@@ -113,7 +113,7 @@ def _solved(rows: np.ndarray, right: np.ndarray) -> Shaft:
 
 
 def _resampled(rows: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The solution, and those of runs of successive windows drawn with repetition."""
+    """The solution, and the solutions for runs of successive windows drawn with repetition."""
     values = np.linalg.lstsq(rows, right, rcond=None)[0]
     random = np.random.default_rng(1)
     runs = len(right) // _RUN

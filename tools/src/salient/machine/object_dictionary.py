@@ -20,7 +20,7 @@ RESETS = ("communication", "node")
 PARAMETER_BASE = 0x2000
 """Index of the first parameter."""
 PARAMETER = "PARAMETER"
-"""What a parameter's object has in `source`."""
+"""Value of `source` of a parameter's object."""
 _KEY = re.compile(r"([0-9A-F]{4})(?:sub([0-9A-F]{1,2}))?")
 _FIELDS = {"name", "kind", "type", "access", "pdo", "initial", "from", "value", "reset", "minimum", "maximum", "text",
            "instances", "count", "string"}
