@@ -16,7 +16,7 @@ from salient.paths import ROOT
 
 PAGE = "".join((ROOT / "docs" / "can" / name).read_text(encoding="utf-8") for name in ("protocol.md", "parameters.md"))
 HEX_BYTES = re.compile(r"`((?:[0-9A-F]{2} )+[0-9A-F]{2})`")
-PLACE = re.compile(r"(?:bytes? (\d)(?: (?:to|and) (\d))?)?(?:, )?(?:bits? (\d)(?: (?:to|and) (\d))?)? `(\w+)`")
+PLACE = re.compile(r"(?:bytes? (\d)(?: (?:to|and) (\d))?)?(?:, )?(?:bits? (\d+)(?: (?:to|and) (\d+))?)? `(\w+)`")
 FRAME = re.compile(r"`([A-Z_]+)` ((?:\w+ (?:0x[0-9A-F]+|[\w.-]+)(?:, )?)+)")
 
 
@@ -144,13 +144,13 @@ def frames_of(page: str, name: str) -> list[tuple[int, bytes]]:
 
 
 def test_every_frame_is_what_the_text_says() -> None:
-    assert check(PAGE) == 25
+    assert check(PAGE) == 27
 
 
 def test_every_protected_message_is_worked_out_and_stated_as_in_the_database() -> None:
     protected = {m.name: m for m in drive_database().messages if "E2EDataId" in attributes(m)}
     stated = {name: layout for name, layout in layouts(PAGE).items() if layout.data_id is not None}
-    assert set(stated) == set(protected) and len(stated) == 5
+    assert set(stated) == set(protected) and len(stated) == 8
     for name, message in protected.items():
         assert stated[name].data_id == int(attributes(message)["E2EDataId"])
         assert frames_of(PAGE, name)
@@ -185,7 +185,7 @@ def test_limits_are_those_of_the_firmware() -> None:
 def test_another_byte_anywhere_is_found() -> None:
     """Each byte of each frame, identifier, data ID and parameter of the CRC, one at a time."""
     places = [match.start(1) + offset for match in HEX_BYTES.finditer(PAGE) for offset in range(0, len(match[1]), 3)]
-    rows = re.compile(r"^\| (?:`(?:DRIVE_(?:COMMAND|TORQUE|ARM)|PARAMETER)\w*`|host|polynomial|initial|final|CRC of).*",
+    rows = re.compile(r"^\| (?:`(?:DRIVE_(?:COMMAND|TORQUE|POSITION|IDENTIFY|ARM)|PARAMETER)\w*`|host|polynomial|initial|final|CRC of).*",
                       re.MULTILINE)
     places += [row.start() + match.end(1) - 2 for row in rows.finditer(PAGE)
                for match in re.finditer(r"`(0x[0-9A-F]{3,8})`", row[0])
@@ -207,7 +207,7 @@ def test_the_drive_finds_every_checksum_right_and_every_other_one_wrong(bench) -
     bench.run_for(0.2)
     names = [name for name, layout in layouts(PAGE).items() if layout.data_id is not None]
     frames = [frame for name in names for frame in frames_of(PAGE, name)]
-    assert len(frames) == 8
+    assert len(frames) == 11
     for flip, expected in ((0, 0), (1, len(frames))):
         for identifier, data in frames:
             sent = data[:-1] + bytes([data[-1] ^ flip])
@@ -217,4 +217,4 @@ def test_the_drive_finds_every_checksum_right_and_every_other_one_wrong(bench) -
         counters = {name: bench.telemetry[f"DRIVE_COMMAND_COUNTERS.{name}"].last for name in
                     ("wrong_length", "wrong_checksum", "wrong_counter", "out_of_range")}
         assert counters == {"wrong_length": 0, "wrong_checksum": expected, "wrong_counter": 0, "out_of_range": 0}
-    assert bench.telemetry["DRIVE_BUS_COUNTERS.command_accepted"].last == 4
+    assert bench.telemetry["DRIVE_BUS_COUNTERS.command_accepted"].last == 7

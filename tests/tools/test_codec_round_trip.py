@@ -329,7 +329,7 @@ def test_schedule_is_that_of_the_dbc(telemetry: Telemetry) -> None:
     parameters = {row.name: row.default for row in read_table()}
     fast, slow = (1, parameters["telemetry_period_ms"]), (2, parameters["telemetry_slow_period_ms"])
     assert [name for name, period in periods.items() if period == fast] == [
-        "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS", "DRIVE_PHASES_E_F",
+        "DRIVE_STATUS", "DRIVE_MOTION", "DRIVE_TORQUE", "DRIVE_CURRENTS", "DRIVE_PHASES_E_F", "DRIVE_POSITION",
     ]  # fmt: skip
     assert {name for name, period in periods.items() if period == slow} == {"DRIVE_BP_PID", "DRIVE_ADAPTATION"}
     assert {rate for rate, _ in periods.values()} == {0, 1, 2}

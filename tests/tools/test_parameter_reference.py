@@ -11,7 +11,7 @@ def test_reference_page_is_generated_from_the_table():
 
 def test_every_parameter_has_a_description():
     rows = read_table()
-    assert len({row.text for row in rows}) == len(rows) == 60
+    assert len({row.text for row in rows}) == len(rows) == 73
     for row in rows:
         assert row.text.endswith("."), row.name
         assert row.constant == row.name.upper()

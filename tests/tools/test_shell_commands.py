@@ -170,7 +170,7 @@ def test_reference_is_in_the_units_of_the_machine_that_the_drive_carries(tmp_pat
 
 @pytest.mark.parametrize(("arguments", "texts"), [
     ([], ["ACTION"]),
-    (["fly"], ["unknown action 'fly'", "speed, torque, load, stop, clear, arm"]),
+    (["fly"], ["unknown action 'fly'", "speed, torque, position, load, stop, clear, arm"]),
     (["speed"], ["RPM"]),
     (["speed", "fast"], ["fast", "number"]),
     (["speed", "nan"], ["nan", "number"]),
