@@ -9,6 +9,7 @@ from salient.paths import BUILD
 STEP_S = 0.04
 """Less than the time after which the drive misses the commands that the server repeats."""
 PICTURES = BUILD / "view"
+_SETTLING_FRAMES = 30
 PATIENCE = 2000
 """Display frames in which a page does what it is asked."""
 
@@ -75,15 +76,22 @@ class Visitor:
 
 
 def nothing_is_cut_off(page):
-    """Names of visible elements that are beyond the width of the page, or whose text is beyond themselves."""
-    return page.evaluate("""() => [...document.querySelectorAll("body *")].filter((each) => {
-        if (each.closest(".uplot, option, .list, canvas, datalist") || !each.checkVisibility()) { return false; }
-        const box = each.getBoundingClientRect();
-        const beyond = box.right > innerWidth + 0.5 || box.left < -0.5;
-        const cut = each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0
-            && getComputedStyle(each).display !== "inline" && !["SELECT", "INPUT"].includes(each.tagName);
-        return beyond || cut;
-    }).map((each) => `${each.tagName} ${each.id} ${each.className}`)""")
+    """Names of visible elements that are beyond the width of the page, or whose text is beyond themselves, once the
+    page has had display frames to follow a change of its size: plots that take long skip some."""
+    return page.evaluate("""async (frames) => {
+        const found = () => [...document.querySelectorAll("body *")].filter((each) => {
+            if (each.closest(".uplot, option, .list, canvas, datalist") || !each.checkVisibility()) { return false; }
+            const box = each.getBoundingClientRect();
+            const beyond = box.right > innerWidth + 0.5 || box.left < -0.5;
+            const cut = each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0
+                && getComputedStyle(each).display !== "inline" && !["SELECT", "INPUT"].includes(each.tagName);
+            return beyond || cut;
+        }).map((each) => `${each.tagName} ${each.id} ${each.className}`);
+        for (let frame = 0; frame < frames && found().length > 0; frame++) {
+            await new Promise(requestAnimationFrame);
+        }
+        return found();
+    }""", _SETTLING_FRAMES)
 
 
 def picture(name):
