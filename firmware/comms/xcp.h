@@ -16,7 +16,7 @@
  * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as the key of the
  * arming: a random or recorded frame opens nothing. A seed serves one attempt within ARMING_RESPONSE_MAX_US. Both are
  * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a
- * command. While it measures, a master sends none: that long, and only CAL/PAG is locked.
+ * command. A master that measures sends no command: then XCP_SILENT_US locks CAL/PAG alone.
  *
  * A write of a parameter is a set of one (parameter_set.h): staged, checked as any other, and applied or refused. It
  * is refused while another set is staged. In a run tunable parameters only. SET_REQUEST STORE_CAL stores.

@@ -73,14 +73,13 @@ typedef struct {
     bool ramp_of_speed;    /* the last command was one of speed */
     int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */
     uint32_t ramp_us;      /* time of the last step */
-    /* Written by the context of its event, and by the background while it has none. Before what only the background
-     * uses: the control interrupt reads its first member, which is so within the offset of a load. */
+    /* Written by the context of its event, and by the background while it has none. Ahead of the members below,
+     * although it is large: the control interrupt reads its first member within the offset of a load. */
     sampler_t sampler;
     /* Used by the background only. */
     comms_t comms;
     nvm_store_t store;
-    /* Written by the control interrupt. Last because it is large: loads and stores reach a limited offset in one
-     * instruction. */
+    /* Written by the control interrupt, from an address of its own. */
     fault_trace_t trace;
     /* Written by the control interrupt, its member `command` by the background with the interrupts masked. */
     identify_t identify;

@@ -43,7 +43,7 @@ typedef struct {
 
 /* Records a period in RUN. [control interrupt] */
 ALWAYS_INLINE void fault_trace_run(fault_trace_t *trace, const fault_trace_values_t *values) {
-    IN_REGISTER(trace); /* else the place is computed from the begin of the drive */
+    IN_REGISTER(trace); /* else the place is computed from the drive's address */
     const uint32_t place = trace->next % FAULT_TRACE_PERIODS;
     fault_trace_period_t *period = &trace->period[place];
     IN_REGISTER(period);

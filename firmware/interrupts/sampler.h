@@ -26,8 +26,8 @@ typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
 #define SAMPLER_WORDS 4096u
 #endif
 
-/* In the deferred interrupt's results an event is the first control interrupt that finds a step complete, which the
- * next one has not begun to change. */
+/* SAMPLER_EVENT_DEFERRED: the first control interrupt that finds a deferred step complete. The next step has changed
+ * none of its results yet. */
 typedef enum {
     SAMPLER_EVENT_CONTROL = 1,
     SAMPLER_EVENT_BACKGROUND,
@@ -79,7 +79,7 @@ typedef struct {
 
 typedef struct {
     uint32_t event; /* at which it records, sampler_event_t; 0: none. Written last when it is armed */
-    uint32_t step;  /* of the deferred interrupt, which was recorded */
+    uint32_t step;  /* deferred step that was recorded last */
     sampler_state_t state;
     sampler_setup_t setup;
     uint32_t record_words;   /* the channels; before them in a stream the time, us */
@@ -115,8 +115,8 @@ bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_MAX])
 /* An event for which sampler->event is set. memory: the drive, of `words` words. [context of the event] */
 void sampler_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us);
 
-/* A control interrupt at the end of which sampler->event has SAMPLER_IN_CONTROL. deferred_steps: that are complete.
- * [control interrupt] */
+/* A control interrupt at the end of which sampler->event has SAMPLER_IN_CONTROL. deferred_steps: number of complete
+ * ones. [control interrupt] */
 void sampler_record_control(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us,
                             uint32_t deferred_steps);
 

@@ -259,6 +259,18 @@ def test_recording_of_another_ending_is_refused(bench, tmp_path):
     assert not (tmp_path / "x.xlsx").exists()
 
 
+def test_buffer_that_was_armed_anew_is_not_read_as_the_earlier_one(bench, tmp_path):
+    running(bench)
+    earlier = bench.scope(["speed_rpm"], trigger="speed_rpm > 2000")
+    later = bench.scope(["current_a_A", "state"])
+    bench.run_for(0.2)
+    with pytest.raises(ScopeError, match="the buffer of the trigger 'speed_rpm > 2000' has been armed anew since"):
+        earlier.read()
+    failure.save(bench, tmp_path, {"replay": ""}, None)
+    assert {path.name for path in tmp_path.glob("scope_*")} == {"scope_1.csv", "scope_1.png"}
+    assert later.recording is not None and earlier.recording is None
+
+
 def test_failure_report_has_what_the_buffer_has_and_leaves_out_what_is_not_complete(bench, tmp_path):
     running(bench)
     read = bench.scope(["torque_reference_Nm"], trigger="torque_reference_Nm > 5")

@@ -15,8 +15,9 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from itertools import pairwise
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -37,7 +38,7 @@ from salient.machine.parameter_table import CHOICES, value_name
 from salient.paths import ROOT
 from salient.view import link as view_link
 from salient.view.command import LogFeed
-from salient.view.commands import COMMANDS
+from salient.view.commands import COMMANDS, Commander
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
 from salient.view.server import PAGES_MAX
@@ -651,6 +652,27 @@ def test_buffer_of_the_drive_is_armed_read_and_shown_with_cursors_and_spectrum(l
     assert bench.drive.state == "ready"
     page.click("#recording-close")
     assert not page.is_visible("#recording") and visitor.errors == []
+
+
+def test_reading_of_the_buffer_begins_anew_after_an_error(monkeypatch):
+    class Buffer:
+        calls = 0
+
+        def is_complete(self):
+            return True
+
+        def parts(self, _):
+            Buffer.calls += 1
+            yield None
+            raise DriveError("the drive has restarted")
+
+    link = SimpleNamespace(kept_log=nullcontext)
+    commander = Commander(link)
+    monkeypatch.setattr(commander, "_scope", Buffer())
+    for call in (1, 2):
+        assert commander.execute("scope_read", {})["value"] == {"state": "reads"}
+        assert commander.execute("scope_read", {}) == {"ok": False, "message": "the drive has restarted"}
+        assert Buffer.calls == call
 
 
 def test_spectrum_has_the_amplitudes_of_sines(live):

@@ -102,11 +102,13 @@ def _raw(text: str, quantity: Quantity, expression: str) -> float:
 
 
 class Scope:
-    """An armed buffer of a session's drive. recording: what the last read() has returned; title: its trigger."""
+    """An armed buffer of a session's drive. recording: what the last read() has returned; title: its trigger; replaced:
+    the buffer, of which a drive has one, has been armed anew since."""
 
     def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], before: int, period_s: float,
                  divider: int, title: str) -> None:
         self.recording: Recording | None = None
+        self.replaced = False
         self.title = title
         self._session = session
         self._quantities = list(quantities)
@@ -119,7 +121,9 @@ class Scope:
 
     def read(self, timeout: float = TIMEOUT_S) -> Recording:
         """Lets time pass until the buffer is complete, and reads it. ScopeError: it is not within `timeout` seconds of
-        virtual time; it stays armed."""
+        virtual time, and stays armed; or it is replaced."""
+        if self.replaced:
+            raise ScopeError(f"the buffer of the trigger '{self.title}' has been armed anew since")
         deadline_ns = self._session.time_ns + round(1e9 * timeout)
         with connected(self._session) as master:
             while not self._is_complete(master):

@@ -228,8 +228,11 @@ class Session(KnownAttributes):
         "state"], trigger="state == fault"); its read() gives the arrays. See salient.bench.sampler.arm."""
         from salient.bench import sampler  # needs it in turn
 
-        self.scopes.append(sampler.arm(self, signals, trigger, before=before, divider=divider))
-        return self.scopes[-1]
+        armed = sampler.arm(self, signals, trigger, before=before, divider=divider)
+        for earlier in self.scopes:
+            earlier.replaced = True
+        self.scopes.append(armed)
+        return armed
 
     def run_for(self, duration_s: float) -> None:
         """Lets virtual time pass; commands go out as they fall due.

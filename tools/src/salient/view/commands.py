@@ -173,10 +173,11 @@ class Commander:
                 if not self._armed.is_complete():
                     return {"state": "waits"}
                 self._parts = self._armed.parts(_PART_WORDS)
-            recording = next(self._parts)
+            parts, self._parts = self._parts, None  # after an error the next call begins anew
+            recording = next(parts)
         if recording is None:
+            self._parts = parts
             return {"state": "reads"}
-        self._parts = None
         signals = [{"name": name, "unit": recording.units[name], "values": values.tolist(),
                     "choices": _choices(recording.names.get(name))} for name, values in recording.values.items()]
         return {"state": "complete", "title": self._armed.title, "time_s": recording.time_s.tolist(),

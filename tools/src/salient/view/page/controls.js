@@ -313,8 +313,8 @@ export function makeRecord(act) {
 }
 
 /** A scale in which also a constant can be read. */
-function withMargin(low, high) {
-    const margin = Math.max(0.08 * (high - low), 0.01 * Math.abs(high), 0.05);
+export function withMargin(low, high, least = 0.05) {
+    const margin = Math.max(0.08 * (high - low), 0.01 * Math.abs(high), least);
     return [low - margin, high + margin];
 }
 

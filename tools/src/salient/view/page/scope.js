@@ -1,13 +1,12 @@
 // The drive's triggered buffer: arming it, and its contents with cursors and spectra.
 
-import { element, make } from "./controls.js";
+import { element, make, withMargin } from "./controls.js";
 import { COLOURS } from "./palette.js";
 
 const POLL_MS = 250;
 const FONT = "12px system-ui, sans-serif";
 
-const signed = (text) => text.replace("-", "−");
-const short = (value) => signed(String(+value.toPrecision(6)));
+const short = (value) => String(+value.toPrecision(6)).replace("-", "−");
 
 /** Amplitudes of a signal at equal steps: {frequency_Hz[], amplitude[]}, from 0 to half of the rate. A Hann window, whose
  *  mean of 1/2 is made up for; a sine between two lines is shown by up to 15 % too small. Its mean is taken off. */
@@ -130,10 +129,7 @@ class Recording {
             width: root.clientWidth,
             height: Math.max(90, Math.min(170, (0.94 * innerHeight - 300) / this.shown.length)),
             legend: { show: false }, padding: [4, 28, 0, 0],
-            scales: { x: { time: false }, y: { range: (_, low, high) => {
-                const margin = Math.max(0.08 * (high - low), 1e-9 + 0.01 * Math.abs(high));
-                return [low - margin, high + margin];
-            } } },
+            scales: { x: { time: false }, y: { range: (_, low, high) => withMargin(low, high, 1e-9) } },
             axes: [{ size: 26, space: 80, font: FONT, values: (_, ticks) => ticks.map((tick) => `${short(tick)} ${this.unit}`) },
                    { size: this.shown.some((each) => each.choices) ? 90 : 58, space: 22, font: FONT, values: (_, ticks) => names(ticks),
                      ...(signal.choices ? { incrs: [1, 2, 5] } : {}) }],
