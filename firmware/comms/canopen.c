@@ -47,8 +47,13 @@ COLD void canopen_telemetry(canopen_t *canopen, const drive_telemetry_t *values)
         .state = (drive_state_t)values->status.state,
         .fault = (uint8_t)values->status.fault,
         .limited = values->status.speed_limited != 0,
+        .has_position = values->status.controller == DRIVE_CONTROLLER_SALIENT,
     };
     canopen->cycle = true;
+}
+
+COLD void canopen_place(canopen_t *canopen, const position_status_t *place) {
+    canopen->place = *place;
 }
 
 /* --- reception --------------------------------------------------------------------------------------------------- */

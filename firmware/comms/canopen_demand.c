@@ -1,5 +1,6 @@
 #include "comms/canopen_demand.h"
 
+#include "comms/canopen_position.h"
 #include "comms/canopen_units.h"
 #include "comms/units.h"
 #include "control/machine_tables.h"
@@ -21,9 +22,20 @@ static bool is_torque(unsigned mode) {
     return mode == CANOPEN_MODE_TORQUE || mode == CANOPEN_MODE_CYCLIC_TORQUE || mode == CANOPEN_MODE_NONE;
 }
 
-COLD bool canopen_demand_has_mode(int32_t mode) {
-    return mode == CANOPEN_MODE_NONE || mode == CANOPEN_MODE_VELOCITY || mode == CANOPEN_MODE_TORQUE ||
-           mode == CANOPEN_MODE_CYCLIC_VELOCITY || mode == CANOPEN_MODE_CYCLIC_TORQUE;
+/* Bit of a mode in 0x6502. */
+#define MODE(mode) (1 << ((mode)-1))
+
+COLD int32_t canopen_demand_modes(const canopen_t *canopen) {
+    const int32_t modes = MODE(CANOPEN_MODE_VELOCITY) | MODE(CANOPEN_MODE_TORQUE) | MODE(CANOPEN_MODE_CYCLIC_VELOCITY) |
+                          MODE(CANOPEN_MODE_CYCLIC_TORQUE);
+    const int32_t position =
+        MODE(CANOPEN_MODE_POSITION) | MODE(CANOPEN_MODE_HOMING) | MODE(CANOPEN_MODE_CYCLIC_POSITION);
+    return canopen->measured.has_position ? modes | position : modes;
+}
+
+COLD bool canopen_demand_has_mode(const canopen_t *canopen, int32_t mode) {
+    return mode == CANOPEN_MODE_NONE ||
+           (mode > 0 && mode <= CANOPEN_MODE_CYCLIC_TORQUE && (canopen_demand_modes(canopen) & MODE(mode)) != 0);
 }
 
 static bool is_cyclic(unsigned mode) {
@@ -57,17 +69,21 @@ COLD void canopen_demand_begin(canopen_t *canopen) {
     canopen_drive_t *drive = &canopen->drive;
     drive->mode = (uint8_t)canopen->values[CANOPEN_VALUE_MODE];
     drive->torque = is_torque(drive->mode);
+    drive->position = canopen_position_is(drive->mode);
     drive->demand_q16 =
         q16(drive->torque ? canopen_torque_of_q8(canopen->measured.reference_q8) * MILLI : present_speed(canopen));
     drive->at_rest = false;
     drive->within_us = 0;
     aim(canopen);
+    if (drive->position) {
+        canopen_position_begin(canopen);
+    }
 }
 
 COLD void canopen_demand_stop(canopen_t *canopen) {
     canopen_drive_t *drive = &canopen->drive;
-    if (drive->torque) {
-        drive->torque = false;
+    if (drive->torque || drive->position) {
+        drive->torque = drive->position = false;
         drive->demand_q16 = q16(present_speed(canopen));
     }
     drive->at_rest = false;
@@ -77,6 +93,8 @@ COLD void canopen_demand_target(canopen_t *canopen, unsigned slot) {
     const bool torque = canopen->drive.torque;
     if (slot == (torque ? CANOPEN_VALUE_TARGET_TORQUE : CANOPEN_VALUE_TARGET_VELOCITY)) {
         aim(canopen);
+    } else if (slot == CANOPEN_VALUE_TARGET_POSITION) {
+        canopen_position_target(canopen);
     }
 }
 
@@ -134,14 +152,15 @@ static uint32_t longer(uint32_t time_us, uint32_t elapsed_us, bool holds) {
     return holds ? fixed_min_u32(time_us + elapsed_us, LONG_US) : 0;
 }
 
-/* Times for which the velocity is within the window of the profile, and below the threshold. */
+/* Times for which velocity or position is within the window of the profile, and the velocity below the threshold. */
 static void watch(canopen_t *canopen, uint32_t elapsed_us, bool halted) {
     canopen_drive_t *drive = &canopen->drive;
     const int32_t velocity = canopen_velocity(canopen, present_speed(canopen));
     const int32_t target = halted || drive->stopping ? 0 : canopen->values[CANOPEN_VALUE_TARGET_VELOCITY];
     const uint32_t away = fixed_magnitude(fixed_subtract(velocity, target));
-    drive->within_us =
-        longer(drive->within_us, elapsed_us, away <= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_WINDOW]);
+    const bool within = drive->position ? canopen_position_within(canopen)
+                                        : away <= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_WINDOW];
+    drive->within_us = longer(drive->within_us, elapsed_us, within);
     drive->slow_us = longer(drive->slow_us, elapsed_us,
                             fixed_magnitude(velocity) <= (uint32_t)canopen->values[CANOPEN_VALUE_VELOCITY_THRESHOLD]);
 }
@@ -158,13 +177,15 @@ COLD void canopen_demand_step(canopen_t *canopen, uint32_t time_us) {
     if (!canopen_enabled(canopen)) {
         drive->mode = (uint8_t)canopen->values[CANOPEN_VALUE_MODE];
         drive->demand_q16 = 0;
-        drive->limited = false;
+        drive->limited = drive->position = false;
         return;
     }
     if (!drive->stopping && drive->mode != canopen->values[CANOPEN_VALUE_MODE]) {
         canopen_demand_begin(canopen);
     }
-    if (drive->torque) {
+    if (drive->position) {
+        canopen_position_step(canopen, elapsed_us, is_halted(canopen));
+    } else if (drive->torque) {
         step_torque(canopen, elapsed_us, is_halted(canopen));
     } else {
         step_velocity(canopen, elapsed_us, is_halted(canopen));
@@ -178,6 +199,12 @@ COLD void canopen_demand_step(canopen_t *canopen, uint32_t time_us) {
 COLD void canopen_demand_command(canopen_t *canopen, command_t *command) {
     canopen_drive_t *drive = &canopen->drive;
     const int32_t demand = demand_of(drive);
+    if (drive->position) {
+        command->mode = DRIVE_MODE_POSITION; /* its speed reference is 0 */
+        canopen_position_command(canopen, is_halted(canopen), &command->position);
+        drive->limited = canopen->place.limited;
+        return;
+    }
     if (drive->torque) {
         command->mode = DRIVE_MODE_TORQUE;
         command->torque_reference_q24 = canopen_torque_q24(demand);
@@ -192,13 +219,19 @@ COLD void canopen_demand_command(canopen_t *canopen, command_t *command) {
 }
 
 COLD int32_t canopen_demand_velocity(const canopen_t *canopen) {
-    return canopen->drive.torque ? 0 : demand_of(&canopen->drive);
+    const canopen_drive_t *drive = &canopen->drive;
+    return drive->position ? canopen_speed_of_machine(units_milli_rpm(canopen->place.speed_reference_q22))
+           : drive->torque ? 0
+                           : demand_of(drive);
 }
 
 COLD bool canopen_demand_reached(const canopen_t *canopen) {
     const canopen_drive_t *drive = &canopen->drive;
     if (drive->state != CANOPEN_OPERATION_ENABLED) {
         return drive->state == CANOPEN_QUICK_STOP_ACTIVE && drive->at_rest;
+    }
+    if (drive->position) {
+        return canopen_position_reached(canopen, is_halted(canopen));
     }
     if (drive->mode == CANOPEN_MODE_TORQUE && drive->torque) {
         return demand_of(drive) == (is_halted(canopen) ? 0 : torque_target(canopen));
@@ -209,6 +242,10 @@ COLD bool canopen_demand_reached(const canopen_t *canopen) {
 
 COLD bool canopen_demand_slow_or_followed(const canopen_t *canopen) {
     const canopen_drive_t *drive = &canopen->drive;
+    if (canopen_position_is(drive->mode)) {
+        return drive->state == CANOPEN_OPERATION_ENABLED && drive->position &&
+               canopen_position_acknowledged(canopen, is_halted(canopen));
+    }
     if (is_cyclic(drive->mode)) {
         return drive->state == CANOPEN_OPERATION_ENABLED && !drive->stopping && !is_halted(canopen);
     }

@@ -1,5 +1,6 @@
 /* Demand of the modes of CiA 402: profile velocity (3) and torque (4), which follow a ramp, and their cyclic
- * synchronous forms (9, 10), which interpolate between references.
+ * synchronous forms (9, 10), which interpolate between references. Those of position are canopen_position.h's; a ramp to
+ * standstill is one of velocity in them, too.
  *
  * Demands are 0.001 r/min, or 0.001 per mille of the rated torque, with 16 fraction bits in 64 bits. In a step the
  * demand moves by at most rate * time, rounded to 2^-16, in at most CANOPEN_STEP_MAX_US of time: a background that was
@@ -43,8 +44,9 @@ void canopen_demand_command(canopen_t *canopen, command_t *command);
 /* Velocity demand, 0.001 r/min; 0 in a mode of torque. */
 int32_t canopen_demand_velocity(const canopen_t *canopen);
 
-/* True for a mode that the drive has. */
-bool canopen_demand_has_mode(int32_t mode);
+/* 0x6502, and true for a mode that it has, or none. Modes of position need a controller of four quadrants. */
+int32_t canopen_demand_modes(const canopen_t *canopen);
+bool canopen_demand_has_mode(const canopen_t *canopen, int32_t mode);
 
 /* Bits 10 and 12 of the statusword. */
 bool canopen_demand_reached(const canopen_t *canopen);

@@ -2,6 +2,7 @@
 
 #include "comms/arming.h"
 #include "comms/canopen_demand.h"
+#include "comms/canopen_position.h"
 #include "comms/canopen_send.h"
 #include "fixed/compiler.h"
 #include "fixed/fixed.h"
@@ -11,6 +12,7 @@
 #define ENABLE_VOLTAGE 0x02u
 #define NO_QUICK_STOP 0x04u
 #define ENABLE_OPERATION 0x08u
+#define ORDER 0x10u /* new set-point, or homing operation start */
 #define FAULT_RESET 0x80u
 
 /* Bits of the statusword. */
@@ -18,11 +20,11 @@
 #define REMOTE 0x0200u
 #define TARGET_REACHED 0x0400u
 #define INTERNAL_LIMIT 0x0800u
-#define SPEED_ZERO_OR_FOLLOWS 0x1000u
+#define SPEED_ZERO_OR_FOLLOWS 0x1000u /* set-point acknowledge and homing attained, too */
+#define POSITION_ERROR 0x2000u
 
 /* Codes of EMCY and their bits of the error register. */
-#define ERROR_RESET 0x0000u
-enum { REGISTER_ANY = 1, REGISTER_CURRENT = 2, REGISTER_VOLTAGE = 4, REGISTER_TEMPERATURE = 8, REGISTER_BUS = 16 };
+enum { REGISTER_ANY = 1, REGISTER_CURRENT = 2, REGISTER_VOLTAGE = 4, REGISTER_TEMPERATURE = 8, REGISTER_BUS = 16, REGISTER_PROFILE = 32 };
 
 typedef enum { NONE, DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, DISABLE_OPERATION, ENABLE } command_code_t;
 
@@ -142,12 +144,23 @@ static void control_ready(canopen_t *canopen, const canopen_context_t *context, 
     }
 }
 
+/* Edges of bit 4 while the drive is enabled, and was before. */
+static void order(canopen_t *canopen, canopen_state_t before, bool bit) {
+    canopen_drive_t *drive = &canopen->drive;
+    if (bit != drive->order_bit && before == CANOPEN_OPERATION_ENABLED && drive->state == before && drive->position &&
+        drive->mode == canopen->values[CANOPEN_VALUE_MODE]) {
+        canopen_position_order(canopen, bit);
+    }
+    drive->order_bit = bit;
+}
+
 COLD void canopen_drive_control(canopen_t *canopen, const canopen_context_t *context) {
     canopen_drive_t *drive = &canopen->drive;
     const uint32_t word = (uint32_t)canopen->values[CANOPEN_VALUE_CONTROLWORD];
     const bool resets = (word & FAULT_RESET) != 0 && !drive->reset_bit;
     drive->reset_bit = (word & FAULT_RESET) != 0;
     const command_code_t code = decode(word);
+    const canopen_state_t before = drive->state;
     drive->enabling = false;
     switch (drive->state) {
     case CANOPEN_SWITCH_ON_DISABLED:
@@ -179,6 +192,7 @@ COLD void canopen_drive_control(canopen_t *canopen, const canopen_context_t *con
     default: /* not ready to switch on, fault reaction active: no command */
         break;
     }
+    order(canopen, before, (word & ORDER) != 0);
 }
 
 COLD void canopen_drive_abort(canopen_t *canopen, const canopen_context_t *context) {
@@ -272,11 +286,13 @@ static void follow_drive(canopen_t *canopen, const canopen_context_t *context) {
     }
 }
 
-/* The end of all errors. */
-static void follow_errors(canopen_t *canopen, uint16_t before) {
-    if (before != 0 && canopen_drive_error_code(canopen) == 0) {
-        canopen_emergency(canopen, ERROR_RESET, FAULT_NONE);
+/* A following error, and the end of all errors. */
+static void follow_errors(canopen_t *canopen) {
+    const uint16_t code = canopen_drive_error_code(canopen);
+    if (code != canopen->drive.error && (code == 0 || code == CANOPEN_FOLLOWING_ERROR)) {
+        canopen_emergency(canopen, code, FAULT_NONE);
     }
+    canopen->drive.error = code;
 }
 
 COLD void canopen_drive_step(canopen_t *canopen, const canopen_context_t *context, command_t *command) {
@@ -284,8 +300,7 @@ COLD void canopen_drive_step(canopen_t *canopen, const canopen_context_t *contex
     commands_t *commands = context->commands;
     follow_drive(canopen, context);
     canopen_demand_step(canopen, context->time_us);
-    follow_errors(canopen, drive->error);
-    drive->error = canopen_drive_error_code(canopen);
+    follow_errors(canopen);
     command_t made = {.request = drive->clearing ? COMMAND_CLEAR_FAULT : COMMAND_OFF, .time_us = context->time_us};
     if (canopen_enabled(canopen)) {
         made.request = COMMAND_RUN;
@@ -308,6 +323,9 @@ COLD uint16_t canopen_drive_statusword(const canopen_t *canopen) {
     if (canopen_demand_slow_or_followed(canopen)) {
         word |= SPEED_ZERO_OR_FOLLOWS;
     }
+    if (canopen_position_failed(canopen)) {
+        word |= POSITION_ERROR;
+    }
     return (uint16_t)word;
 }
 
@@ -315,6 +333,9 @@ COLD uint16_t canopen_drive_error_code(const canopen_t *canopen) {
     const canopen_measured_t *measured = &canopen->measured;
     if (measured->state == DRIVE_STATE_FAULT && measured->fault < FAULT_COUNT) {
         return canopen_error_codes[measured->fault];
+    }
+    if (canopen->drive.position && canopen->place.following_error) {
+        return CANOPEN_FOLLOWING_ERROR;
     }
     return canopen->communication_error;
 }
@@ -332,7 +353,7 @@ COLD uint8_t canopen_drive_error_register(const canopen_t *canopen) {
     case 4:
         return REGISTER_ANY | REGISTER_TEMPERATURE;
     case 8:
-        return REGISTER_ANY | REGISTER_BUS;
+        return REGISTER_ANY | (code == CANOPEN_FOLLOWING_ERROR ? REGISTER_PROFILE : REGISTER_BUS);
     default:
         return REGISTER_ANY;
     }

@@ -35,6 +35,9 @@ void canopen_drive_control(canopen_t *canopen, const canopen_context_t *context)
 #define CANOPEN_BUS_OFF 0x8140u
 #define CANOPEN_RPDO_TIMEOUT 0x8250u
 
+/* Error code of a following error: the position loop has stopped, and the drive runs on. */
+#define CANOPEN_FOLLOWING_ERROR 0x8611u
+
 /* The master is lost, for the reason of an error code: emergency, error behaviour 0x1029, canopen_drive_abort. */
 void canopen_drive_lose_master(canopen_t *canopen, const canopen_context_t *context, unsigned code);
 

@@ -3,6 +3,7 @@
 #include "comms/canopen_demand.h"
 #include "comms/canopen_drive.h"
 #include "comms/canopen_mapping.h"
+#include "comms/canopen_position.h"
 #include "comms/canopen_units.h"
 #include "control/machine_tables.h"
 #include "fixed/compiler.h"
@@ -13,7 +14,13 @@
 #define CAN_STORE 1 /* saves on command */
 #define ERRORS_MAX 8u
 #define SYNC_ID 0x80
-#define VELOCITY_POLARITY 0x40
+#define POLARITIES 0xC0
+#define PROFILE_TRAPEZOID 0
+#define PROFILE_JERK_LIMITED 3
+
+/* LSBs of following_error_deg and position_window_deg in a revolution. */
+#define ERRORS_PER_REV (360 << 7)
+#define WINDOWS_PER_REV (360 << 15)
 
 COLD uint32_t canopen_size_of_bytes(const canopen_context_t *context, const canopen_object_t *object) {
     if (object->row.type != CANOPEN_STRING) {
@@ -53,6 +60,30 @@ static int32_t error_field(const canopen_t *canopen, const canopen_context_t *co
     return (int32_t)(canopen_error_codes[fault.fault] | (uint32_t)fault.fault << 16);
 }
 
+/* Those of the position loop. */
+static int32_t read_position(const canopen_t *canopen, const canopen_context_t *context,
+                             const canopen_object_t *object) {
+    const int32_t *parameters = context->parameters->values;
+    switch (object->row.value) {
+    case CANOPEN_FROM_POSITION_DEMAND:
+        return canopen_position_units(canopen, canopen->place.reference);
+    case CANOPEN_FROM_POSITION:
+        return canopen_position_units(canopen, canopen->place.position);
+    case CANOPEN_FROM_POSITION_ERROR:
+        return canopen_position_units(canopen, canopen->place.error);
+    case CANOPEN_FROM_FOLLOWING_WINDOW:
+        return canopen_distance_units(canopen, parameters[PARAMETER_FOLLOWING_ERROR_DEG], ERRORS_PER_REV);
+    case CANOPEN_FROM_POSITION_WINDOW:
+        return canopen_distance_units(canopen, parameters[PARAMETER_POSITION_WINDOW_DEG], WINDOWS_PER_REV);
+    case CANOPEN_FROM_HOMING_METHOD:
+        return canopen_homing_number(parameters[PARAMETER_HOMING_METHOD]);
+    case CANOPEN_FROM_HOMING_SPEED:
+        return canopen_rpm_units(canopen, parameters[PARAMETER_HOMING_SPEED_RPM]);
+    default:
+        return 0;
+    }
+}
+
 /* Objects that parts of the drive own. */
 static int32_t read_drive(const canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object) {
     const canopen_measured_t *measured = &canopen->measured;
@@ -79,8 +110,10 @@ static int32_t read_drive(const canopen_t *canopen, const canopen_context_t *con
         return (int32_t)canopen_rated_torque();
     case CANOPEN_FROM_MAX_TORQUE:
         return fixed_clamp(canopen_torque(context->parameters->values[PARAMETER_TORQUE_MAX_NM]), 0, UINT16_MAX);
+    case CANOPEN_FROM_MODES:
+        return canopen_demand_modes(canopen);
     default:
-        return 0;
+        return read_position(canopen, context, object);
     }
 }
 
@@ -143,13 +176,20 @@ static uint32_t check_choice(const canopen_t *canopen, const canopen_object_t *o
     bool allowed;
     switch (object->row.value) {
     case CANOPEN_VALUE_MODE:
-        allowed = canopen_demand_has_mode(value);
+        allowed = canopen_demand_has_mode(canopen, value);
         break;
     case CANOPEN_VALUE_QUICK_STOP_OPTION:
         allowed = value != 3 && value != 4;
         break;
+    case CANOPEN_VALUE_PROFILE_TYPE:
+        allowed = value == PROFILE_TRAPEZOID || value == PROFILE_JERK_LIMITED;
+        break;
+    case CANOPEN_VALUE_POSITION_MIN:
+        return value < canopen->values[CANOPEN_VALUE_POSITION_MAX] ? CANOPEN_DONE : CANOPEN_INCOMPATIBLE;
+    case CANOPEN_VALUE_POSITION_MAX:
+        return value > canopen->values[CANOPEN_VALUE_POSITION_MIN] ? CANOPEN_DONE : CANOPEN_INCOMPATIBLE;
     case CANOPEN_VALUE_POLARITY:
-        allowed = value == 0 || value == VELOCITY_POLARITY;
+        allowed = (value & ~POLARITIES) == 0;
         break;
     case CANOPEN_VALUE_CONSUMER: /* node and time, or neither */
         allowed = (value >> 16 == 0) == ((value & UINT16_MAX) == 0);
@@ -196,6 +236,25 @@ static uint32_t write_parameter(const canopen_context_t *context, unsigned index
     return canopen_verdict(&verdict);
 }
 
+/* Parameters of the position loop in units of the profile. */
+static uint32_t write_position(const canopen_t *canopen, const canopen_context_t *context,
+                               const canopen_object_t *object, int32_t value) {
+    switch (object->row.value) {
+    case CANOPEN_FROM_FOLLOWING_WINDOW:
+        return write_parameter(context, PARAMETER_FOLLOWING_ERROR_DEG,
+                               canopen_distance(canopen, value, ERRORS_PER_REV));
+    case CANOPEN_FROM_POSITION_WINDOW:
+        return write_parameter(context, PARAMETER_POSITION_WINDOW_DEG,
+                               canopen_distance(canopen, value, WINDOWS_PER_REV));
+    case CANOPEN_FROM_HOMING_METHOD: /* one that the drive has not is beyond the parameter's range */
+        return write_parameter(context, PARAMETER_HOMING_METHOD, (int32_t)canopen_homing_method(value));
+    case CANOPEN_FROM_HOMING_SPEED:
+        return write_parameter(context, PARAMETER_HOMING_SPEED_RPM, canopen_rpm(canopen, value));
+    default:
+        return CANOPEN_READ_ONLY;
+    }
+}
+
 static uint32_t write_from(canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object,
                            int32_t value) {
     switch (object->row.value) {
@@ -219,7 +278,7 @@ static uint32_t write_from(canopen_t *canopen, const canopen_context_t *context,
         canopen->error_base = nvm_store_newest_fault(context->store);
         return CANOPEN_DONE;
     default:
-        return CANOPEN_READ_ONLY;
+        return write_position(canopen, context, object, value);
     }
 }
 

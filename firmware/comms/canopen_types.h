@@ -9,6 +9,7 @@
 #include "comms/commands.h"
 #include "comms/frame_queue.h"
 #include "comms/parameter_set.h"
+#include "control/position/position.h"
 #include "drive_telemetry.h"
 #include "hal_can.h"
 #include "storage/nvm_store.h"
@@ -102,6 +103,33 @@ typedef enum {
     CANOPEN_STATES
 } canopen_state_t;
 
+/* Set-point of profile position, in the units of position_set_point_t. */
+typedef struct {
+    int64_t target;
+    int32_t speed_q22, acceleration_rpm_s, deceleration_rpm_s, jerk_rpm_s2;
+} canopen_move_t;
+
+typedef enum {
+    CANOPEN_HOMING_IDLE,
+    CANOPEN_HOMING_WANTED, /* begins once the position loop has seen the halt before it */
+    CANOPEN_HOMING_RUNS,
+    CANOPEN_HOMING_ATTAINED,
+    CANOPEN_HOMING_FAILED
+} canopen_homing_t;
+
+/* Modes of position (canopen_position.h). */
+typedef struct {
+    position_order_t order; /* published, with its sequence */
+    uint32_t sequence;
+    canopen_move_t move, next; /* that runs, or has ended; that waits for its end */
+    bool targeted;             /* a set-point or target has come since the mode began */
+    bool moving;               /* `move` has not arrived */
+    bool waiting;              /* `next` does */
+    bool acknowledged;         /* bit 12 of profile position */
+    canopen_homing_t homing;
+    uint32_t silent_us; /* since the last cyclic target */
+} canopen_position_t;
+
 typedef struct {
     canopen_state_t state;
     bool stopping; /* a ramp to standstill, after which `after` is entered */
@@ -110,6 +138,7 @@ typedef struct {
     bool clearing;       /* fault reset: the drive is asked to clear its fault */
     bool lost;           /* fault of the profile: the master was lost */
     bool torque;         /* the demand is one of torque */
+    bool position;       /* the demand is one of position */
     uint8_t mode;        /* in effect */
     int64_t demand_q16;  /* 0.001 r/min, or 0.001 per mille of the rated torque */
     int32_t target;      /* of a cyclic mode, to which it interpolates, 0.001 as above */
@@ -120,9 +149,10 @@ typedef struct {
     uint32_t clearing_us;
     bool enabling; /* enable operation has come before the drive was ready */
     uint32_t enabling_us;
-    uint32_t within_us; /* for which the velocity is within its window */
+    uint32_t within_us; /* for which the velocity, or the position, is within its window */
     uint32_t slow_us;   /* for which it is below its threshold */
     bool reset_bit;     /* bit 7 of the last controlword */
+    bool order_bit;     /* bit 4 likewise */
     uint16_t error;     /* error code of the last step */
     bool limited;       /* the demand is beyond what the drive does */
 } canopen_drive_t;
@@ -135,6 +165,7 @@ typedef struct {
     uint8_t fault;
     bool limited;
     bool supplied;
+    bool has_position; /* the controller has the modes of position */
 } canopen_measured_t;
 
 typedef struct {
@@ -163,7 +194,9 @@ typedef struct {
     canopen_tpdo_t tpdo[CANOPEN_PDOS];
     canopen_lss_t lss;
     canopen_drive_t drive;
+    canopen_position_t position;
     canopen_measured_t measured;
+    position_status_t place; /* of the position loop, likewise */
 } canopen_t;
 
 /* Objects on which a frame may act, for one call. */

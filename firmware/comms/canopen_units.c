@@ -8,7 +8,16 @@
 /* Limits of the factors in objects.toml. */
 #define GROUP_MAX 4095
 #define GEAR_MAX 1023
+#define MILLI 1000
+#define FEED_MAX (INT32_C(1) << 24)
 #define ACCELERATION_MAX (INT32_C(1) << 30)
+
+#define VELOCITY_POLARITY 0x40
+#define POSITION_POLARITY 0x80
+
+/* Beyond every position and distance of the drive: 2^20 and 2^6 rev. */
+#define REVOLUTIONS_MAX (INT64_C(1) << 20)
+#define DISTANCE_MAX (INT64_C(1) << 38)
 
 /* value * numerator / divisor, to nearest, away from zero; |numerator * value| < 2^62. */
 static int64_t scaled(int64_t value, int64_t numerator, int64_t divisor) {
@@ -23,22 +32,90 @@ static int64_t factor(const canopen_t *canopen, unsigned of_group, unsigned of_g
            fixed_clamp(canopen->values[of_gear], 1, GEAR_MAX);
 }
 
-static bool reversed(const canopen_t *canopen) {
-    return canopen->values[CANOPEN_VALUE_POLARITY] != 0;
+static bool reversed(const canopen_t *canopen, int32_t of) {
+    return (canopen->values[CANOPEN_VALUE_POLARITY] & of) != 0;
+}
+
+/* Revolutions of the motor per position: shaft revolutions of the feed * motor revolutions < 2^20 / units < 2^34. */
+static int64_t position_numerator(const canopen_t *canopen) {
+    return (int64_t)fixed_clamp(canopen->values[CANOPEN_VALUE_FEED_SHAFT], 1, GEAR_MAX) *
+           fixed_clamp(canopen->values[CANOPEN_VALUE_GEAR_MOTOR], 1, GEAR_MAX);
+}
+
+static int64_t position_divisor(const canopen_t *canopen) {
+    return (int64_t)fixed_clamp(canopen->values[CANOPEN_VALUE_FEED], 1, FEED_MAX) *
+           fixed_clamp(canopen->values[CANOPEN_VALUE_GEAR_SHAFT], 1, GEAR_MAX);
+}
+
+/* Without the polarity. The fraction of a revolution in two steps of 16 bits. */
+static int64_t revolutions_q32(const canopen_t *canopen, int32_t position) {
+    const int64_t divisor = position_divisor(canopen);
+    int64_t rest = (int64_t)position * position_numerator(canopen); /* below 2^51 */
+    int64_t quotient = fixed_divide(rest, divisor);
+    rest -= quotient * divisor;
+    if (quotient > REVOLUTIONS_MAX || quotient < -REVOLUTIONS_MAX) {
+        return (quotient > 0 ? REVOLUTIONS_MAX : -REVOLUTIONS_MAX) * POSITION_ONE_REV;
+    }
+    for (int step = 0; step < 2; step++) {
+        const int64_t digit = fixed_divide(rest * (1 << 16), divisor);
+        rest = rest * (1 << 16) - digit * divisor;
+        quotient = quotient * (1 << 16) + digit;
+    }
+    return quotient;
+}
+
+static int32_t units_of(const canopen_t *canopen, int64_t position) {
+    const int64_t divisor = position_divisor(canopen);
+    const int64_t whole = position >> 32, fraction_q28 = (position & (POSITION_ONE_REV - 1)) >> 4;
+    const int64_t product_q8 = whole * divisor * (1 << 8) + (fraction_q28 * divisor >> 20); /* below 2^61 */
+    return fixed_saturate(scaled(product_q8, 1, position_numerator(canopen) * (1 << 8)));
+}
+
+COLD int64_t canopen_position_q32(const canopen_t *canopen, int32_t position) {
+    const int64_t forward = revolutions_q32(canopen, position);
+    return reversed(canopen, POSITION_POLARITY) ? -forward : forward;
+}
+
+COLD int32_t canopen_position_units(const canopen_t *canopen, int64_t position) {
+    return units_of(canopen, reversed(canopen, POSITION_POLARITY) ? -position : position);
+}
+
+COLD int32_t canopen_distance(const canopen_t *canopen, int32_t units, int32_t per_rev) {
+    const int64_t distance = fixed_clamp_64(revolutions_q32(canopen, units), 0, DISTANCE_MAX);
+    return fixed_saturate(fixed_shift(distance * per_rev, 32));
+}
+
+COLD int32_t canopen_distance_units(const canopen_t *canopen, int32_t distance, int32_t per_rev) {
+    return units_of(canopen, scaled(distance, POSITION_ONE_REV, per_rev));
+}
+
+COLD int32_t canopen_rate(const canopen_t *canopen, int32_t value) {
+    const int64_t numerator = factor(canopen, CANOPEN_VALUE_ACCELERATION_NUMERATOR, CANOPEN_VALUE_GEAR_MOTOR);
+    const int64_t below = factor(canopen, CANOPEN_VALUE_ACCELERATION_DIVISOR, CANOPEN_VALUE_GEAR_SHAFT);
+    return fixed_max(fixed_saturate(scaled(value, numerator, below << machine_tables.speed_exponent)), 1);
 }
 
 COLD int32_t canopen_velocity_milli(const canopen_t *canopen, int32_t velocity) {
     const int64_t numerator = factor(canopen, CANOPEN_VALUE_VELOCITY_NUMERATOR, CANOPEN_VALUE_GEAR_MOTOR);
     const int64_t below = factor(canopen, CANOPEN_VALUE_VELOCITY_DIVISOR, CANOPEN_VALUE_GEAR_SHAFT);
     const int32_t milli = fixed_saturate(scaled((int64_t)velocity * 1000, numerator, below));
-    return reversed(canopen) ? fixed_subtract(0, milli) : milli;
+    return reversed(canopen, VELOCITY_POLARITY) ? fixed_subtract(0, milli) : milli;
 }
 
 COLD int32_t canopen_velocity(const canopen_t *canopen, int32_t milli_rpm) {
     const int64_t numerator = factor(canopen, CANOPEN_VALUE_VELOCITY_NUMERATOR, CANOPEN_VALUE_GEAR_MOTOR);
     const int64_t below = factor(canopen, CANOPEN_VALUE_VELOCITY_DIVISOR, CANOPEN_VALUE_GEAR_SHAFT);
     const int32_t velocity = fixed_saturate(scaled(milli_rpm, below, numerator * 1000));
-    return reversed(canopen) ? fixed_subtract(0, velocity) : velocity;
+    return reversed(canopen, VELOCITY_POLARITY) ? fixed_subtract(0, velocity) : velocity;
+}
+
+COLD int32_t canopen_rpm(const canopen_t *canopen, int32_t velocity) {
+    return (int32_t)scaled(canopen_machine_speed(fixed_abs(canopen_velocity_milli(canopen, velocity))), 1, MILLI);
+}
+
+COLD int32_t canopen_rpm_units(const canopen_t *canopen, int32_t rpm) {
+    const int32_t milli = fixed_saturate((int64_t)rpm * MILLI);
+    return fixed_abs(canopen_velocity(canopen, canopen_speed_of_machine(milli)));
 }
 
 COLD int32_t canopen_acceleration_milli(const canopen_t *canopen, int32_t acceleration) {

@@ -8,6 +8,7 @@
 #include "comms/xcp.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
+#include "hal_time.h"
 
 #define US_PER_MS 1000u
 
@@ -207,6 +208,11 @@ COLD static bool background_canopen(comms_t *comms, hal_t *hal, const comms_obje
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL && hal_can_receive(hal, &frame); i++) {
         canopen_receive(&comms->canopen, &context, &frame);
+    }
+    if (comms->canopen.cycle) {
+        hal_critical_enter(hal);
+        canopen_place(&comms->canopen, objects->place);
+        hal_critical_leave(hal);
     }
     const bool commanded = canopen_step(&comms->canopen, &context, &comms->command);
     while (send_response(comms, hal)) {

@@ -358,6 +358,7 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
         .conditions = {.running = !may_configure(drive),
                        .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6},
         .store = &drive->store,
+        .place = &drive->control.position.status,
         .trace = &drive->trace,
         .self_test = &drive->self_test,
         .control_parameters = &drive->control_parameters,

@@ -43,6 +43,8 @@ typedef struct {
     int32_t jerk_rpm_s2;        /* r/min/s^2, >= 0 */
     int32_t speed_offset_q22;   /* cyclic: added to the speed reference, likewise Q9.22 */
     int32_t torque_offset_q24;  /* cyclic: added to the torque reference, N m, Q7.24 */
+    uint32_t cycle_ms;          /* cyclic: period of the targets; 0: position_cycle_ms */
+    int64_t lowest, highest;    /* software end stops within the parameters', 2^-32 rev; none unless lowest < highest */
 } position_set_point_t;
 
 /* Written by the deferred interrupt; the background reads it with the interrupts masked, or by an unmasked read. */
@@ -56,6 +58,7 @@ typedef struct {
     bool following_error;        /* it was beyond following_error_deg: stopped until a halt */
     bool limited;                /* the target is beyond a software end stop, and is the stop instead */
     uint32_t sequence;           /* of the set point that the reference follows */
+    uint32_t arrived;            /* of the one that in_position and reference_ended are of */
     int64_t position;            /* 2^-32 rev, in every state and mode */
     int64_t reference;           /* 2^-32 rev; position while not active */
     int32_t error;               /* reference - position, 2^-32 rev, saturated */

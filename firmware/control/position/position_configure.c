@@ -59,8 +59,17 @@ COLD static void set_scales(const position_settings_t *settings, position_parame
         profile_scale_of(INT64_C(1) << 32, (per_q16 >> 8) * ((int64_t)settings->acceleration_q32 * rate_per_tick >> 8));
 }
 
+COLD static position_cycle_t cycle_of(int64_t cycle_ms) {
+    const int64_t ticks = fixed_clamp_64(cycle_ms, 1, POSITION_CYCLE_TICKS_MAX);
+    return (position_cycle_t){
+        .ticks = (uint32_t)ticks,
+        .half_per_ticks = profile_scale_of(1, 2 * ticks),
+        .half_per_ticks2 = profile_scale_of(1, 2 * ticks * ticks),
+        .half_per_ticks3 = profile_scale_of(1, 2 * ticks * ticks * ticks),
+    };
+}
+
 COLD position_parameters_t position_configure(const position_settings_t *settings) {
-    const int64_t ticks = fixed_clamp(settings->cycle_ms, 1, POSITION_CYCLE_TICKS_MAX);
     const int64_t edge = POSITION_MAX << (PROFILE_FRACTION_BITS - 32);
     const uint32_t periods = settings->control_rate_hz / PROFILE_TICK_HZ;
     position_parameters_t position = {
@@ -75,10 +84,7 @@ COLD position_parameters_t position_configure(const position_settings_t *setting
         .homing_speed = in_unit(settings->homing_speed_rpm, settings->speed_exponent, PER_RPM_Q8) >> 8,
         .homing_torque_q24 =
             settings->homing_torque_q24 > 0 ? settings->homing_torque_q24 : settings->torque_max_q24 / 4,
-        .cycle_ticks = (uint32_t)ticks,
-        .half_per_ticks = profile_scale_of(1, 2 * ticks),
-        .half_per_ticks2 = profile_scale_of(1, 2 * ticks * ticks),
-        .half_per_ticks3 = profile_scale_of(1, 2 * ticks * ticks * ticks),
+        .cycle = cycle_of(settings->cycle_ms),
         .limits = limits_from(settings),
     };
     position.highest = position.highest > position.lowest ? position.highest : position.lowest;
@@ -86,9 +92,25 @@ COLD position_parameters_t position_configure(const position_settings_t *setting
     return position;
 }
 
+/* 2^-48 rev from 2^-32 rev, within the end stops of the parameters. */
+COLD static int64_t within(const position_parameters_t *parameters, int64_t position) {
+    const int64_t limited = fixed_clamp_64(position, -POSITION_MAX, POSITION_MAX);
+    return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->lowest, parameters->highest);
+}
+
 COLD position_command_t position_command(const position_parameters_t *parameters,
                                          const position_set_point_t *set_point) {
-    position_command_t command = {.set_point = *set_point, .limits = parameters->limits};
+    position_command_t command = {
+        .set_point = *set_point,
+        .limits = parameters->limits,
+        .cycle = set_point->cycle_ms > 0 ? cycle_of(set_point->cycle_ms) : parameters->cycle,
+        .lowest = parameters->lowest,
+        .highest = parameters->highest,
+    };
+    if (set_point->lowest < set_point->highest) {
+        command.lowest = within(parameters, set_point->lowest);
+        command.highest = within(parameters, set_point->highest);
+    }
     if (set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 || set_point->deceleration_rpm_s > 0 ||
         set_point->jerk_rpm_s2 > 0) {
         const profile_limits_t *most = &parameters->limits;

@@ -70,8 +70,8 @@ COLD NOINLINE static void stop(position_t *position, const profile_limits_t *lim
     }
 }
 
-static void go_to(const position_parameters_t *parameters, position_t *position, int64_t target) {
-    position->target = fixed_clamp_64(target, parameters->lowest, parameters->highest);
+static void go_to(position_t *position, const position_command_t *command, int64_t target) {
+    position->target = fixed_clamp_64(target, command->lowest, command->highest);
     position->status.limited = position->target != target;
     position->stops = false;
 }
@@ -163,17 +163,17 @@ COLD NOINLINE static void home(position_t *position, const position_command_t *c
 }
 
 /* a0 and q of the cubic from the reference to a position with a speed; false when it exceeds the limits. */
-COLD static bool begin_cubic(const position_parameters_t *parameters, position_t *position,
-                             const profile_limits_t *limits, int64_t to, int64_t speed) {
-    const int64_t ticks = parameters->cycle_ticks;
+COLD static bool begin_cubic(position_t *position, const position_command_t *command, int64_t to, int64_t speed) {
+    const profile_limits_t *limits = &command->limits;
+    const int64_t ticks = command->cycle.ticks;
     profile_state_t *from = &position->profile.start;
     const int64_t way = to - from->x;
     const int64_t way_max = limits->speed * (ticks + 1);
     if (way > way_max || way < -way_max) {
         return false;
     }
-    const int64_t a = 2 * profile_scale(6 * way - (4 * from->v + 2 * speed) * ticks, parameters->half_per_ticks2);
-    const int64_t q = 2 * profile_scale((from->v + speed) * ticks - 2 * way, parameters->half_per_ticks3);
+    const int64_t a = 2 * profile_scale(6 * way - (4 * from->v + 2 * speed) * ticks, command->cycle.half_per_ticks2);
+    const int64_t q = 2 * profile_scale((from->v + speed) * ticks - 2 * way, command->cycle.half_per_ticks3);
     const int64_t last = a + 6 * q * ticks;
     const int64_t most = limits->acceleration > limits->deceleration ? limits->acceleration : limits->deceleration;
     if (a > most || a < -most || last > most || last < -most || speed > limits->speed || speed < -limits->speed) {
@@ -181,7 +181,7 @@ COLD static bool begin_cubic(const position_parameters_t *parameters, position_t
     }
     const profile_state_t arrival = {.x = to, .v = speed, .a = 0};
     const int64_t rest = profile_stop(limits, &arrival);
-    if (rest > parameters->highest || rest < parameters->lowest) {
+    if (rest > command->highest || rest < command->lowest) {
         return false;
     }
     from->a = a & ~INT64_C(1);
@@ -191,18 +191,17 @@ COLD static bool begin_cubic(const position_parameters_t *parameters, position_t
 }
 
 /* Speed at the last of three targets, or two. */
-static int64_t speed_of_targets(const position_parameters_t *parameters, const position_t *position, int64_t to) {
+static int64_t speed_of_targets(const position_t *position, const position_cycle_t *cycle, int64_t to) {
     const int64_t bound = PROFILE_SPEED_MAX * POSITION_CYCLE_TICKS_MAX;
     const int64_t before = fixed_clamp_64(to - position->past[0], -bound, bound);
     const int64_t earlier = fixed_clamp_64(position->past[0] - position->past[1], -bound, bound);
     if (position->targets < 2) {
         return 0;
     }
-    return profile_scale(position->targets < 3 ? 2 * before : 3 * before - earlier, parameters->half_per_ticks);
+    return profile_scale(position->targets < 3 ? 2 * before : 3 * before - earlier, cycle->half_per_ticks);
 }
 
-COLD NOINLINE static void follow_targets(const position_parameters_t *parameters, position_t *position,
-                                         const position_command_t *command, bool begins) {
+COLD NOINLINE static void follow_targets(position_t *position, const position_command_t *command, bool begins) {
     const int64_t to = to_profile(limited(command->set_point.target));
     if (begins) {
         position->targets = 0;
@@ -213,15 +212,15 @@ COLD NOINLINE static void follow_targets(const position_parameters_t *parameters
         position->targets += position->targets < 3;
         position->silent_ticks = 0;
         position->cubic_ticks = 0;
-        go_to(parameters, position, to);
+        go_to(position, command, to);
         if (!position->status.limited) {
-            begin_cubic(parameters, position, &command->limits, to, speed_of_targets(parameters, position, to));
+            begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to));
         }
         position->past[1] = position->past[0];
         position->past[0] = to;
         return;
     }
-    const uint32_t patience = 3 * parameters->cycle_ticks;
+    const uint32_t patience = 3 * command->cycle.ticks;
     position->silent_ticks += position->silent_ticks <= patience;
     if (position->silent_ticks > patience) {
         position->cubic_ticks = 0;
@@ -249,13 +248,14 @@ COLD NOINLINE static void check_following(const position_parameters_t *parameter
     }
     const bool arrived =
         !position->stops && position->cubic_ticks == 0 && profile_arrived(&position->profile, position->target);
+    status->arrived = position->sequence;
     status->reference_ended = arrived;
     status->in_position = arrived && error <= parameters->window && error >= -parameters->window;
 }
 
 /* The order decides where the reference goes from this tick on. */
-COLD NOINLINE static void decide(const position_parameters_t *parameters, position_t *position,
-                                 const position_command_t *command, const position_sample_t *sample) {
+COLD NOINLINE static void decide(position_t *position, const position_command_t *command,
+                                 const position_sample_t *sample) {
     const position_set_point_t *set_point = &command->set_point;
     const bool begins = set_point->order != position->order;
     position->status.limited = position->status.limited && !begins;
@@ -268,11 +268,11 @@ COLD NOINLINE static void decide(const position_parameters_t *parameters, positi
     if (position->status.following_error || set_point->order == POSITION_ORDER_HALT) {
         stop(position, &command->limits);
     } else if (set_point->order == POSITION_ORDER_CYCLIC) {
-        follow_targets(parameters, position, command, begins);
+        follow_targets(position, command, begins);
     } else if (set_point->order == POSITION_ORDER_HOME) {
         home(position, command, sample, begins);
     } else {
-        go_to(parameters, position, to_profile(limited(set_point->target)));
+        go_to(position, command, to_profile(limited(set_point->target)));
     }
     if (set_point->order != POSITION_ORDER_CYCLIC || position->status.following_error) {
         position->cubic_ticks = 0;
@@ -297,7 +297,7 @@ COLD NOINLINE static void tick(const position_parameters_t *parameters, position
         profile_tick(profile);
     }
     check_following(parameters, position, sample);
-    decide(parameters, position, command, sample);
+    decide(position, command, sample);
     profile->end = profile_advance(&profile->start, profile->q);
 }
 
@@ -348,7 +348,7 @@ position_output_t position_step(const position_parameters_t *parameters, positio
         status->active = true;
         begin_here(position, sample);
         position->order = POSITION_ORDER_HALT; /* whatever comes begins */
-        decide(parameters, position, command, sample);
+        decide(position, command, sample);
         position->profile.end = profile_advance(&position->profile.start, position->profile.q);
     }
     position->phase += sample->periods;

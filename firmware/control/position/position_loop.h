@@ -34,7 +34,15 @@
 #include "control/position/position.h"
 #include "control/position/profile.h"
 
-#define POSITION_CYCLE_TICKS_MAX 20
+#define POSITION_CYCLE_TICKS_MAX 100
+
+/* Period of cyclic targets. */
+typedef struct {
+    uint32_t ticks;                  /* 1..POSITION_CYCLE_TICKS_MAX */
+    profile_scale_t half_per_ticks;  /* 1 / 2n */
+    profile_scale_t half_per_ticks2; /* 1 / 2n^2 */
+    profile_scale_t half_per_ticks3; /* 1 / 2n^3 */
+} position_cycle_t;
 
 /* Positions in 2^-48 rev. */
 typedef struct {
@@ -50,17 +58,16 @@ typedef struct {
     int64_t following_error;
     int64_t homing_speed; /* 2^-48 rev per tick */
     int32_t homing_torque_q24;
-    uint32_t cycle_ticks;            /* 1..POSITION_CYCLE_TICKS_MAX */
-    profile_scale_t half_per_ticks;  /* 1 / 2n of the cycle */
-    profile_scale_t half_per_ticks2; /* 1 / 2n^2 */
-    profile_scale_t half_per_ticks3; /* 1 / 2n^3 */
-    profile_limits_t limits;         /* of a set point without its own */
+    position_cycle_t cycle;  /* of a set point without its own */
+    profile_limits_t limits; /* likewise */
 } position_parameters_t;
 
 /* Set point with what follows from it; written by the background with the interrupts masked. */
 typedef struct {
     position_set_point_t set_point;
     profile_limits_t limits;
+    position_cycle_t cycle;
+    int64_t lowest, highest; /* software end stops, 2^-48 rev */
 } position_command_t;
 
 typedef enum { POSITION_HOMING_IDLE, POSITION_HOMING_SEEKS, POSITION_HOMING_RETURNS } position_homing_step_t;
