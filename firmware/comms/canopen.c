@@ -52,10 +52,6 @@ COLD void canopen_telemetry(canopen_t *canopen, const drive_telemetry_t *values)
     canopen->cycle = true;
 }
 
-COLD void canopen_place(canopen_t *canopen, const position_status_t *place) {
-    canopen->place = *place;
-}
-
 /* --- reception --------------------------------------------------------------------------------------------------- */
 
 static void leave_operational(canopen_t *canopen, const canopen_context_t *context, canopen_nmt_t to) {

@@ -23,9 +23,6 @@ void canopen_receive(canopen_t *canopen, const canopen_context_t *context, const
 /* Takes over a telemetry cycle. */
 void canopen_telemetry(canopen_t *canopen, const drive_telemetry_t *values);
 
-/* Takes over what the position loop reports, after a telemetry cycle. */
-void canopen_place(canopen_t *canopen, const position_status_t *place);
-
 /* Watches the master and queues what is due; true when *command is to be executed: once in each telemetry cycle. To be
  * called in every round of the background. */
 bool canopen_step(canopen_t *canopen, const canopen_context_t *context, command_t *command);

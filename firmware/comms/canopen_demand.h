@@ -1,6 +1,6 @@
 /* Demand of the modes of CiA 402: profile velocity (3) and torque (4), which follow a ramp, and their cyclic
- * synchronous forms (9, 10), which interpolate between references. Those of position are canopen_position.h's; a ramp to
- * standstill is one of velocity in them, too.
+ * synchronous forms (9, 10), which interpolate between references. Modes of position: canopen_position.h; a ramp to
+ * standstill is one of the velocity in them, too.
  *
  * Demands are 0.001 r/min, or 0.001 per mille of the rated torque, with 16 fraction bits in 64 bits. In a step the
  * demand moves by at most rate * time, rounded to 2^-16, in at most CANOPEN_STEP_MAX_US of time: a background that was

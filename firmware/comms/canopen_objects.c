@@ -60,7 +60,7 @@ static int32_t error_field(const canopen_t *canopen, const canopen_context_t *co
     return (int32_t)(canopen_error_codes[fault.fault] | (uint32_t)fault.fault << 16);
 }
 
-/* Those of the position loop. */
+/* Objects of the position loop. */
 static int32_t read_position(const canopen_t *canopen, const canopen_context_t *context,
                              const canopen_object_t *object) {
     const int32_t *parameters = context->parameters->values;

@@ -137,7 +137,8 @@ static void step_homing(canopen_t *canopen, bool halted) {
     const position_status_t *place = &canopen->place;
     if (halted) {
         order_homing(position, false);
-    } else if (position->homing == CANOPEN_HOMING_WANTED && position->order == POSITION_ORDER_HALT && follows(canopen)) {
+    } else if (position->homing == CANOPEN_HOMING_WANTED && position->order == POSITION_ORDER_HALT &&
+               follows(canopen)) {
         position->homing = CANOPEN_HOMING_RUNS;
     } else if (position->homing == CANOPEN_HOMING_RUNS && position->order == POSITION_ORDER_HOME && follows(canopen) &&
                !place->homing) {
@@ -196,6 +197,7 @@ COLD void canopen_position_step(canopen_t *canopen, uint32_t elapsed_us, bool ha
 static void limit(const canopen_t *canopen, position_set_point_t *set_point) {
     const int64_t a = canopen_position_q32(canopen, canopen->values[CANOPEN_VALUE_POSITION_MIN]);
     const int64_t b = canopen_position_q32(canopen, canopen->values[CANOPEN_VALUE_POSITION_MAX]);
+    set_point->bounded = true;
     set_point->lowest = a < b ? a : b;
     set_point->highest = a < b ? b : a;
 }
@@ -222,8 +224,8 @@ COLD void canopen_position_command(const canopen_t *canopen, bool halted, positi
         set_point->acceleration_rpm_s = set_point->deceleration_rpm_s = rate;
     } else if (position->order == POSITION_ORDER_HALT) {
         const bool fast = halted && values[CANOPEN_VALUE_HALT_OPTION] == HALT_FAST;
-        set_point->deceleration_rpm_s = canopen_rate(
-            canopen, values[fast ? CANOPEN_VALUE_QUICK_STOP_DECELERATION : CANOPEN_VALUE_DECELERATION]);
+        set_point->deceleration_rpm_s =
+            canopen_rate(canopen, values[fast ? CANOPEN_VALUE_QUICK_STOP_DECELERATION : CANOPEN_VALUE_DECELERATION]);
     }
     limit(canopen, set_point);
 }

@@ -38,7 +38,7 @@ void canopen_position_target(canopen_t *canopen);
 /* A telemetry cycle: the next set-point, and the order that is published. */
 void canopen_position_step(canopen_t *canopen, uint32_t elapsed_us, bool halted);
 
-/* The set point of a command to run. halted: the deceleration is that of a halt. */
+/* The set point of a command to run; halted: with the deceleration of a halt. */
 void canopen_position_command(const canopen_t *canopen, bool halted, position_set_point_t *set_point);
 
 /* At the target of the last set-point by the position loop, within the window. */

@@ -14,8 +14,8 @@
 
 #include "comms/canopen_types.h"
 
-/* 2^-32 rev from position units, and the reverse: within 2^-32 rev, beyond +-2^20 rev limited; to nearest within 2^-4 of a unit,
- * |position| < 2^50, saturates. */
+/* 2^-32 rev from position units, and the reverse: within 2^-32 rev, beyond +-2^20 rev limited; to nearest within 2^-4
+ * of a unit, |position| < 2^50, saturates. */
 int64_t canopen_position_q32(const canopen_t *canopen, int32_t position);
 int32_t canopen_position_units(const canopen_t *canopen, int64_t position);
 

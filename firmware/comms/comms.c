@@ -8,7 +8,6 @@
 #include "comms/xcp.h"
 #include "drive_codec.h"
 #include "fixed/compiler.h"
-#include "hal_time.h"
 
 #define US_PER_MS 1000u
 
@@ -37,6 +36,10 @@ COLD void comms_choose(comms_t *comms, int32_t protocol, uint32_t time_us) {
 #else
     canopen_init(&comms->canopen, (unsigned)protocol, comms->node_offset / NODE_STEP + 1u, time_us);
 #endif
+}
+
+COLD position_status_t *comms_place(comms_t *comms) {
+    return is_canopen(comms) ? &comms->canopen.place : NULL;
 }
 
 COLD void comms_bus_off(comms_t *comms) {
@@ -208,11 +211,6 @@ COLD static bool background_canopen(comms_t *comms, hal_t *hal, const comms_obje
     hal_can_frame_t frame;
     for (int i = 0; i < COMMS_FRAMES_PER_CALL && hal_can_receive(hal, &frame); i++) {
         canopen_receive(&comms->canopen, &context, &frame);
-    }
-    if (comms->canopen.cycle) {
-        hal_critical_enter(hal);
-        canopen_place(&comms->canopen, objects->place);
-        hal_critical_leave(hal);
     }
     const bool commanded = canopen_step(&comms->canopen, &context, &comms->command);
     while (send_response(comms, hal)) {

@@ -63,7 +63,6 @@ typedef struct {
     const fault_trace_t *trace;
     const self_test_t *self_test;
     const control_parameters_t *control_parameters;
-    const position_status_t *place; /* read with the interrupts masked */
 } comms_objects_t;
 
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */
@@ -101,5 +100,8 @@ static inline bool comms_telemetry_due(const comms_t *comms, uint32_t time_us) {
 /* Queues one cycle of telemetry and fills the free mailboxes; writes values->bus_counters.telemetry_dropped. With
  * CANopen takes the values over. [background] */
 void comms_telemetry(comms_t *comms, hal_t *hal, drive_telemetry_t *values);
+
+/* Where the report of the position loop is to be copied in each telemetry cycle; NULL without CANopen. [background] */
+position_status_t *comms_place(comms_t *comms);
 
 #endif

@@ -344,6 +344,12 @@ COLD NOINLINE static void send_telemetry(drive_t *drive, hal_t *hal, uint32_t ti
     drive_telemetry_t values;
     collect_telemetry(drive, hal, time_us, &values);
     comms_telemetry(&drive->comms, hal, &values);
+    position_status_t *place = comms_place(&drive->comms);
+    if (place != NULL) {
+        hal_critical_enter(hal);
+        *place = drive->control.position.status;
+        hal_critical_leave(hal);
+    }
 }
 
 COLD void drive_background(drive_t *drive, hal_t *hal) {
@@ -358,7 +364,6 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
         .conditions = {.running = !may_configure(drive),
                        .dc_link_voltage_q6 = drive->control.measurement.dc_link_voltage_q6},
         .store = &drive->store,
-        .place = &drive->control.position.status,
         .trace = &drive->trace,
         .self_test = &drive->self_test,
         .control_parameters = &drive->control_parameters,

@@ -14,7 +14,7 @@ canopen = pytest.importorskip("canopen")
 pytestmark = pytest.mark.bench_options(protocol="canopen")
 
 UNITS = 131072
-"""Of a revolution, with the feed constant after a reset; a count of 17 bits, too."""
+"""Position units in a revolution, with the feed constant after a reset; also counts of 17 bits."""
 NEW, AT_ONCE, RELATIVE, HALT, ENABLED = 0x10, 0x20, 0x40, 0x100, 0x0F
 REACHED, ACKNOWLEDGED, LIMITED, ERROR = 0x400, 0x1000, 0x800, 0x2000
 

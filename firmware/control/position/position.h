@@ -36,6 +36,7 @@ typedef struct {
     position_order_t order;
     position_homing_t homing;   /* of POSITION_ORDER_HOME */
     uint32_t sequence;          /* changes with each set point: two equal cyclic targets are two */
+    bool bounded;               /* by lowest and highest */
     int64_t target;             /* 2^-32 rev; of POSITION_ORDER_HOME: what the place found is called */
     int32_t speed_q22;          /* of the profile, rad/s times the unit of the machine's speeds, Q9.22, >= 0 */
     int32_t acceleration_rpm_s; /* r/min/s, >= 0 */
@@ -44,7 +45,7 @@ typedef struct {
     int32_t speed_offset_q22;   /* cyclic: added to the speed reference, likewise Q9.22 */
     int32_t torque_offset_q24;  /* cyclic: added to the torque reference, N m, Q7.24 */
     uint32_t cycle_ms;          /* cyclic: period of the targets; 0: position_cycle_ms */
-    int64_t lowest, highest;    /* software end stops within the parameters', 2^-32 rev; none unless lowest < highest */
+    int64_t lowest, highest;    /* software end stops within the parameters', 2^-32 rev, lowest <= highest */
 } position_set_point_t;
 
 /* Written by the deferred interrupt; the background reads it with the interrupts masked, or by an unmasked read. */

@@ -107,7 +107,7 @@ COLD position_command_t position_command(const position_parameters_t *parameters
         .lowest = parameters->lowest,
         .highest = parameters->highest,
     };
-    if (set_point->lowest < set_point->highest) {
+    if (set_point->bounded) {
         command.lowest = within(parameters, set_point->lowest);
         command.highest = within(parameters, set_point->highest);
     }

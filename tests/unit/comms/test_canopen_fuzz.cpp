@@ -30,9 +30,10 @@ class CanopenFuzz : public CanopenBench {
         const bool known = canopen_find(index, sub, &object) == CANOPEN_DONE;
         const uint32_t limits[] = {uint32_t(object.row.minimum), uint32_t(object.row.maximum),
                                    uint32_t(object.row.minimum) - 1u, uint32_t(object.row.maximum) + 1u};
-        const uint32_t maps[] = {0x60400010, 0x60FF0020, 0x60710010, 0x60600008, 0x606C0020, 0x60410010};
+        const uint32_t maps[] = {0x60400010, 0x60FF0020, 0x60710010, 0x60600008, 0x606C0020,
+                                 0x60410010, 0x607A0020, 0x60640020, 0x60810020};
         value = known && any(2) == 0 ? limits[any(4)]
-                : any(3) == 0        ? maps[any(6)]
+                : any(3) == 0        ? maps[any(9)]
                 : any(3) == 0        ? 0x80000000u | 0x180u + any(0x400)
                 : any(2) == 0        ? any(12)
                                      : uint32_t(random());
@@ -63,10 +64,11 @@ class CanopenFuzz : public CanopenBench {
 
     void any_pdo() {
         const unsigned pdo = any(CANOPEN_PDOS);
-        const unsigned words[] = {6, 7, 15, 6, 7, 15, 15, 0x10F, 2, 0, 0x80, unsigned(any(65536))};
+        const unsigned words[] = {6,    7,    15,   6,    7, 15, 15,   0x10F,
+                                  0x1F, 0x3F, 0x5F, 0x7F, 2, 0,  0x80, unsigned(any(65536))};
         bytes_t data = any_bytes(any(9));
         if (data.size() >= 2) {
-            const unsigned word = words[any(12)];
+            const unsigned word = words[any(16)];
             data[0] = uint8_t(word);
             data[1] = uint8_t(word >> 8);
         }
@@ -128,10 +130,50 @@ class CanopenFuzz : public CanopenBench {
         ASSERT_TRUE(canopen.node >= 1 && canopen.node <= 127);
     }
 
+    void expect_safe_set_point() {
+        positions++;
+        const position_set_point_t &set_point = command.position;
+        ASSERT_EQ(command.speed_reference_q22, 0) << "of a drive that loses its commands";
+        ASSERT_LE(set_point.order, POSITION_ORDER_HALT);
+        ASSERT_EQ(set_point.homing, POSITION_HOMING_METHODS);
+        ASSERT_LE(std::abs(set_point.target), POSITION_MAX);
+        ASSERT_TRUE(set_point.bounded);
+        ASSERT_LE(set_point.lowest, set_point.highest);
+        ASSERT_TRUE(set_point.cycle_ms >= 1 && set_point.cycle_ms <= 100);
+        ASSERT_GE(set_point.speed_q22, 0);
+        ASSERT_GE(set_point.acceleration_rpm_s, 0);
+        ASSERT_GE(set_point.deceleration_rpm_s, 0);
+        ASSERT_GE(set_point.jerk_rpm_s2, 0);
+        if (set_point.order == POSITION_ORDER_PROFILE) {
+            ASSERT_GT(set_point.speed_q22, 0) << "0 is the drive's own limit";
+        }
+    }
+
+    // Reports of the position loop, plausible or not.
+    void any_place() {
+        position_status_t &place = canopen.place;
+        place.active = command.mode == DRIVE_MODE_POSITION && any(20) != 0;
+        place.sequence = any(4) != 0 ? command.position.sequence : uint32_t(random());
+        place.arrived = any(4) != 0 ? place.sequence : uint32_t(random());
+        place.in_position = any(2);
+        place.homing = any(2);
+        place.homed = any(2);
+        place.homing_failed = any(4) == 0;
+        place.following_error = any(30) == 0;
+        place.limited = any(4) == 0;
+        place.position = int64_t(uint64_t(random()) << 32 | random()) >> (18 + any(40));
+        place.reference = place.position + int32_t(random());
+        place.error = int32_t(random());
+        place.speed_reference_q22 = int32_t(random());
+    }
+
     void expect_safe_command() {
         ASSERT_EQ(command.request == COMMAND_RUN, canopen_enabled(&canopen));
         ASSERT_LE(std::abs(double(command.speed_reference_q22)),
                   machine_tables.speed_reference_max * 1.0472e-4 * (1 << 22) + 2);
+        if (command.mode == DRIVE_MODE_POSITION) {
+            expect_safe_set_point();
+        }
         for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
             ASSERT_GE(parameters.values[i], parameters_row(i)->minimum) << i;
             ASSERT_LE(parameters.values[i], parameters_row(i)->maximum) << i;
@@ -140,6 +182,7 @@ class CanopenFuzz : public CanopenBench {
 
     std::mt19937 random{20261129};
     bool synchronised = false;
+    unsigned positions = 0;
 };
 
 TEST_F(CanopenFuzz, nothing_unsafe_and_no_hang) {
@@ -158,6 +201,8 @@ TEST_F(CanopenFuzz, nothing_unsafe_and_no_hang) {
                                   : command.request == COMMAND_CLEAR_FAULT ? DRIVE_STATE_READY
                                                                            : values.status.state;
             values.status.fault = values.status.state == DRIVE_STATE_FAULT ? 1 + any(FAULT_COUNT - 1) : 0;
+            values.status.controller = any(50) == 0 ? DRIVE_CONTROLLER_PAPER : DRIVE_CONTROLLER_SALIENT;
+            any_place();
             conditions.running = command.request == COMMAND_RUN;
             cycle();
             conditions.running = command.request == COMMAND_RUN;
@@ -171,6 +216,7 @@ TEST_F(CanopenFuzz, nothing_unsafe_and_no_hang) {
         canopen.node = canopen.node == 0 ? NODE : canopen.node;
     }
     EXPECT_GT(enabled, frames / 100) << "the frames reach what they are to try";
+    EXPECT_GT(positions, frames / 2000);
     values.status.state = DRIVE_STATE_READY;
     values.motion.speed_rpm = 0;
     conditions.running = false;

@@ -116,7 +116,7 @@ TEST_F(CanopenPosition, one_set_point_waits_and_holds_the_acknowledge) {
     EXPECT_NE(status() & ACKNOWLEDGED, 0u) << "no place for a third one";
     set_point(3000);
     set_point(4000, AT_ONCE);
-    EXPECT_EQ(command.position.target, 1000 * (REV / UNITS)) << "edges without an acknowledge to fall are none";
+    EXPECT_EQ(command.position.target, 1000 * (REV / UNITS)) << "no effect of an edge while it is acknowledged";
     arrive();
     EXPECT_EQ(command.position.target, 2000 * (REV / UNITS));
     EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED), 0u);

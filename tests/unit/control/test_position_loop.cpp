@@ -127,6 +127,61 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     EXPECT_EQ(less.limits.deceleration, parameters.limits.deceleration);
 }
 
+TEST_F(PositionLoop, end_stops_of_a_set_point_are_within_those_of_the_parameters) {
+    const auto rev = [](double turns) { return int64_t(turns * REV_32); };
+    const auto bounds = [&](double low, double high) {
+        position_set_point_t set_point = {};
+        set_point.bounded = true;
+        set_point.lowest = rev(low);
+        set_point.highest = rev(high);
+        const position_command_t made = position_command(&parameters, &set_point);
+        return std::pair(double(made.lowest) / REV_48, double(made.highest) / REV_48);
+    };
+    EXPECT_EQ(bounds(-1.5, 0.25), std::pair(-1.5, 0.25));
+    EXPECT_EQ(bounds(-1e6, 1e6), std::pair(-100.0, 100.0));
+    EXPECT_EQ(bounds(5000, 1e6), std::pair(100.0, 100.0)) << "out of reach";
+    EXPECT_EQ(bounds(0, 0), std::pair(0.0, 0.0)) << "a place";
+    order(POSITION_ORDER_PROFILE, 3.0);
+    EXPECT_EQ(double(command.highest) / REV_48, 100.0) << "unbounded";
+    command.highest = int64_t(REV_48);
+    ticks(2000);
+    EXPECT_NEAR(rotor_rev, 1.0, 1e-6);
+    EXPECT_TRUE(position.status.limited);
+}
+
+TEST_F(PositionLoop, the_period_of_a_set_point_replaces_the_parameters) {
+    position_set_point_t set_point = {};
+    EXPECT_EQ(position_command(&parameters, &set_point).cycle.ticks, 4u);
+    set_point.cycle_ms = 50;
+    EXPECT_EQ(position_command(&parameters, &set_point).cycle.ticks, 50u);
+    set_point.cycle_ms = UINT32_MAX;
+    EXPECT_EQ(position_command(&parameters, &set_point).cycle.ticks, unsigned(POSITION_CYCLE_TICKS_MAX));
+    rotor_rev = 0.0;
+    for (int k = 0; k <= 60; k++) { // a line in steps of 100 ms, by its cubic
+        set_point.order = POSITION_ORDER_CYCLIC;
+        set_point.sequence++;
+        set_point.target = int64_t(0.1 * k * REV_32);
+        command = position_command(&parameters, &set_point);
+        ticks(100);
+        ASSERT_NEAR(rotor_rev, 0.1 * (k - 0.02), 0.05) << k;
+        ASSERT_TRUE(k < 5 || std::abs(speed_rev_s - 1.0) < 0.02) << speed_rev_s;
+    }
+}
+
+TEST_F(PositionLoop, in_position_is_of_the_set_point_that_arrived_names) {
+    order(POSITION_ORDER_PROFILE, 0.5);
+    ticks(1000);
+    const uint32_t before = command.set_point.sequence;
+    EXPECT_EQ(position.status.arrived, before);
+    order(POSITION_ORDER_PROFILE, 0.75);
+    for (int k = 0; k < 3 * PERIODS; k++) { // at no instant is the old flag the new set point's
+        step();
+        ASSERT_FALSE(position.status.in_position && position.status.arrived == command.set_point.sequence) << k;
+    }
+    ticks(1000);
+    EXPECT_TRUE(position.status.in_position && position.status.arrived == command.set_point.sequence);
+}
+
 TEST_F(PositionLoop, begins_where_the_rotor_is_and_moves_to_the_target_over_turns) {
     order(POSITION_ORDER_PROFILE, -12.375);
     step();
@@ -332,6 +387,10 @@ TEST_F(PositionLoop, any_set_points_keep_the_limits_and_the_formats) {
         set_point.speed_q22 = int32_t(random());
         set_point.acceleration_rpm_s = int32_t(random() >> (random() % 32));
         set_point.jerk_rpm_s2 = int32_t(random());
+        set_point.cycle_ms = uint32_t(random() >> (random() % 64));
+        set_point.bounded = random() % 2;
+        set_point.lowest = std::min(int64_t(random()), int64_t(random())) >> (2 + random() % 40);
+        set_point.highest = set_point.lowest + int64_t(random() >> (2 + random() % 40));
         command = position_command(&parameters, &set_point);
         ticks(1 + int(random() % 8));
         ASSERT_LE(std::abs(position.profile.end.v), PROFILE_SPEED_MAX);
