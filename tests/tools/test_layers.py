@@ -36,7 +36,7 @@ PYTHON_LAYERS = (
     "salient.cli", "salient.elf", "salient.drive_layout", "salient.vm", "salient.machine", "salient.finite_elements",
     "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
-    "salient.experiments.settings", "salient.identify", "salient.experiments", "salient.test_runner", "salient.wheel",
+    "salient.identify", "salient.experiments", "salient.test_runner", "salient.wheel",
     "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
     "salient.documents", "salient.evidence",
