@@ -65,14 +65,13 @@ static int32_t speed_q22(const canopen_t *canopen, int32_t velocity) {
 }
 
 static canopen_move_t set_point(const canopen_t *canopen) {
-    const canopen_position_t *position = &canopen->position;
     const int32_t *values = canopen->values;
-    const int64_t before = position->waiting ? position->next.target : position->move.target;
     const int64_t wanted = canopen_position_q32(canopen, values[CANOPEN_VALUE_TARGET_POSITION]); /* below 2^52 */
     const bool relative = (controlword(canopen) & RELATIVE) != 0;
     const bool smooth = values[CANOPEN_VALUE_PROFILE_TYPE] == JERK_LIMITED;
     return (canopen_move_t){
-        .target = fixed_clamp_64(relative ? before + wanted : wanted, -POSITION_MAX, POSITION_MAX),
+        .target =
+            fixed_clamp_64(relative ? canopen->position.move.target + wanted : wanted, -POSITION_MAX, POSITION_MAX),
         .speed_q22 = speed_q22(canopen, values[CANOPEN_VALUE_PROFILE_VELOCITY]),
         .acceleration_rpm_s = canopen_rate(canopen, values[CANOPEN_VALUE_ACCELERATION]),
         .deceleration_rpm_s = canopen_rate(canopen, values[CANOPEN_VALUE_DECELERATION]),

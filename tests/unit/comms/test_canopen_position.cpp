@@ -92,7 +92,12 @@ TEST_F(CanopenPosition, a_set_point_is_taken_by_the_edge_acknowledged_and_reache
     EXPECT_EQ(command.position.order, POSITION_ORDER_PROFILE);
     EXPECT_DOUBLE_EQ(target_rev(), 0.5);
     EXPECT_EQ(status() & REACHED, 0u);
+    write(0x6068, 0, 0);
+    follow();
+    EXPECT_EQ(canopen.place.sequence, command.position.sequence);
+    EXPECT_EQ(status() & REACHED, 0u) << "the loop has the set-point, its flag is still the old one's";
     leave();
+    write(0x6068, 0, 5);
     follow(10);
     EXPECT_NE(status() & ACKNOWLEDGED, 0u) << "until bit 4 falls";
     control(ENABLE);

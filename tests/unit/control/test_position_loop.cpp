@@ -191,6 +191,10 @@ TEST_F(PositionLoop, begins_where_the_rotor_is_and_moves_to_the_target_over_turn
     EXPECT_NEAR(rotor_rev, -12.375, 1e-6);
     EXPECT_TRUE(position.status.in_position && position.status.reference_ended && position.status.active);
     EXPECT_EQ(position.status.reference, int64_t(-12.375 * REV_32));
+    rotor_rev += 0.01; // beyond the window of half a degree
+    ticks(2);
+    EXPECT_FALSE(position.status.in_position);
+    EXPECT_TRUE(position.status.reference_ended);
 }
 
 TEST_F(PositionLoop, is_followed_outside_of_position_mode_and_by_hand) {
