@@ -59,14 +59,11 @@ typedef struct {
     sto_monitor_t sto;
     stall_monitor_t stall;
     flux_monitor_t flux;
-    flux_angle_t flux_angle[HAL_PHASES_MAX];
     bool conduction_ends; /* of a phase, within two checks: its last sample is to have hardly a flux linkage */
     shaft_torque_t shaft_torque;
     table_scale_t table_scale; /* a property of the machine: survives the end of a run */
     degraded_t degraded;
     available_torque_t available_torque; /* for telemetry */
-    thermal_t thermal;
-    temperature_t temperature;
     self_test_t self_test;
     watchdog_monitor_t watchdog;
     bool ramping;          /* the torque ramps to zero, without commands; the next three are for this */
@@ -79,6 +76,9 @@ typedef struct {
     /* Used by the background only. */
     comms_t comms;
     nvm_store_t store;
+    flux_angle_t flux_angle[HAL_PHASES_MAX];
+    thermal_t thermal;
+    temperature_t temperature;
     /* Written by the control interrupt, from an address of its own. */
     fault_trace_t trace;
     /* Written by the control interrupt, its member `command` by the background with the interrupts masked. */
