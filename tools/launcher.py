@@ -102,8 +102,8 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs", "evidence")
-"""Commands that need no drive."""
+WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs", "evidence", "board")
+"""Commands that need no drive of the host; `board build` builds by itself."""
 
 
 def _vm_packages() -> list[str]:
@@ -251,6 +251,8 @@ def _needs_wasm(options: argparse.Namespace) -> bool:
 
 def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, ...]:
     """Debian packages that a command needs."""
+    if options.command == "board" and options.action == "build":
+        return BUILD_DEPENDENCIES + TARGET_DEPENDENCIES["cortex-m4"][:2]
     if not needs_build(options):
         return tuple(dependency for dependency in BUILD_DEPENDENCIES if dependency.package == "python3-venv")
     found = BUILD_DEPENDENCIES + TARGET_DEPENDENCIES[target]

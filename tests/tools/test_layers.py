@@ -19,8 +19,8 @@ from salient.paths import ROOT
 Graph = Mapping[str, set[str]]
 
 C_LAYERS = (
-    "hal/", "hal/qemu/", "firmware/fixed/", "firmware/control/", "firmware/storage/", "firmware/monitors/",
-    "firmware/interrupts/", "firmware/comms/", "firmware/drive/", "firmware/layout/",
+    "hal/", "hal/qemu/", "hal/skeleton/", "firmware/fixed/", "firmware/control/", "firmware/storage/", "firmware/monitors/",
+    "firmware/interrupts/", "firmware/comms/", "firmware/drive/", "firmware/layout/", "hal/stm32g4/",
     "emulator/plant/", "emulator/plant_library/", "emulator/plant_benchmark/", "emulator/fmi/", "emulator/rig/",
     "emulator/host/", "emulator/campaign/", "emulator/wasm/", "emulator/qemu/", "emulator/qemu/image/",
 )  # fmt: skip
@@ -34,7 +34,7 @@ PYTHON_LAYERS = (
     "salient.config", "salient.version", "salient.light_can", "salient.dbc", "salient.toml_file", "salient.exceptions",
     "salient.c_limits", "salient.language", "salient.turns",
     "salient.cli", "salient.elf", "salient.drive_layout", "salient.vm", "salient.machine", "salient.finite_elements",
-    "salient.generate", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
+    "salient.generate", "salient.board", "salient.reference.torque_speed_bound", "salient.reference.copper_bound",
     "salient.bus", "salient.bench", "salient.suite", "salient.view", "salient.tab", "salient.bench.pytest_plugin",
     "salient.experiments.settings", "salient.identify", "salient.experiments", "salient.test_runner", "salient.wheel", "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
