@@ -79,6 +79,10 @@ static void measure(uint64_t address, uint32_t size, unsigned *cycles, unsigned 
     uint8_t code[8192];
     const uint32_t length = size < sizeof code ? size : sizeof code;
     uc_mem_read(engine, address, code, length);
+    if (cycles_floating(code, length)) {
+        soc_violation("fault of the processor: floating-point instruction from 0x%08X on, the unit is off",
+                      (uint32_t)address);
+    }
     *cycles = cycles_of(code, length, in_flash ? wait_states : 0);
     *instructions = cycles_instructions(code, length);
     if (in_flash) {
@@ -255,7 +259,8 @@ static void execute(void) {
         return;
     }
     if (error) {
-        soc_violation("fault of the processor: %s", uc_strerror(error));
+        soc_violation("fault of the processor: %s",
+                      error == UC_ERR_INSN_INVALID ? "undefined instruction" : uc_strerror(error));
     }
     if (!cpu.exited && waits()) {
         cpu.asleep = true;

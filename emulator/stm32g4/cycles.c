@@ -71,6 +71,18 @@ unsigned cycles_instructions(const uint8_t *code, uint32_t size) {
     return count;
 }
 
+bool cycles_floating(const uint8_t *code, uint32_t size) {
+    for (uint32_t at = 0; at + 3 < size;) {
+        const uint16_t first = (uint16_t)(code[at] | code[at + 1] << 8);
+        const uint16_t second = (uint16_t)(code[at + 2] | code[at + 3] << 8);
+        if ((first & 0xEC00) == 0xEC00 && is_wide(first) && (second & 0x0E00) == 0x0A00) {
+            return true;
+        }
+        at += is_wide(first) ? 4 : 2;
+    }
+    return false;
+}
+
 unsigned cycles_of(const uint8_t *code, uint32_t size, unsigned wait_states) {
     unsigned sum = 0;
     for (uint32_t at = 0; at + 1 < size;) {

@@ -71,13 +71,16 @@ def block(folder: Path, base: int, prefix: str) -> list[tuple[str, int, int, int
     """Registers of a peripheral or of a cluster in it."""
     rows = []
     text = Path(f"{folder}.rs").read_text()
-    aliases = dict(re.findall(r"^pub type (\w+) = crate::Reg<(\w+)::", text, re.M))
+    aliases = {kind: folder / f"{module}.rs"
+               for kind, module in re.findall(r"^pub type (\w+) = crate::Reg<(\w+)::", text, re.M)}
+    for other, kind in re.findall(r"^pub use crate::stm32g474::(\w+)::([A-Z]\w*);", text, re.M):
+        aliases[kind] = folder.parent / other / f"{kind.lower()}.rs"
     for offset, name, kind in re.findall(
             r"///(0x[0-9a-f]+)(?:\.\.0x[0-9a-f]+)? - [^\n]*\n(?:    ///[^\n]*\n)*(?:    #[^\n]*\n)*"
             r"    pub const fn (\w+)\(&self\) -> &(\w+)", text):
         at = base + int(offset, 16)
         if kind in aliases:
-            rows.append((f"{prefix}_{name.upper()}", at, *register(folder / f"{aliases[kind]}.rs")))
+            rows.append((f"{prefix}_{name.upper()}", at, *register(aliases[kind])))
         elif (folder / f"{kind.lower()}.rs").exists():
             rows += block(folder / kind.lower(), at, f"{prefix}_{name.upper()}")
     # Arrays without names of their own.
@@ -86,7 +89,7 @@ def block(folder: Path, base: int, prefix: str) -> list[tuple[str, int, int, int
             r"    pub const fn (\w+)\(&self, n: usize\) -> &(\w+)", text):
         if kind in aliases:
             for n, at in enumerate(range(int(start, 16), int(end, 16), 4)):
-                rows.append((f"{prefix}_{name.upper()}{n}", base + at, *register(folder / f"{aliases[kind]}.rs")))
+                rows.append((f"{prefix}_{name.upper()}{n}", base + at, *register(aliases[kind])))
     return rows
 
 

@@ -38,7 +38,7 @@ static const uint32_t start_ns[OSCILLATORS] = {
     [HSE] = 2000000, [PLL] = 40000, [LSI] = 130000, [LSE] = 1000000, [HSI48] = 2500};
 
 static uint64_t ready_ns[OSCILLATORS]; /* SOC_NEVER: off */
-static uint64_t fast_since_ns;         /* HCLK above 80 MHz was asked for with its prescaler at 2 */
+static uint64_t halved_from_ns;        /* the system clock was selected */
 
 static bool ready(oscillator_t oscillator) {
     return soc_ns(soc.now) >= ready_ns[oscillator];
@@ -137,16 +137,18 @@ static void clocks_changed(void) {
     soc.timer2_hz = timer_hz(hclk, cfgr >> 11 & 7);
 }
 
-/* The transition of 7.2.7 between slow and fast system clocks. */
-static void check_transition(uint32_t old_hz) {
-    const uint32_t hz = prescaled(sysclk_hz(), REG(CFGR) >> 4 & 15, 8);
+/* The transition of 7.2.7 from a slow system clock to one above 80 MHz: half of it comes first, for 1 us. */
+static void check_transition(uint32_t old_select, uint32_t old_hz) {
+    const uint32_t select = REG(CFGR) & 3, hz = prescaled(sysclk_hz(), REG(CFGR) >> 4 & 15, 8);
     const uint64_t now = soc_ns(soc.now);
-    if (hz > 80 * MHZ && old_hz <= 80 * MHZ &&
-        (2 * (uint64_t)old_hz < hz || fast_since_ns == SOC_NEVER || now < fast_since_ns + 1000)) {
+    const bool whole = hz == sysclk_hz(), fast = sysclk_hz() > 80 * MHZ;
+    if (fast && whole && old_hz != hz && (select != old_select || now < halved_from_ns + 1000)) {
         soc_violation("HCLK from %u to %u Hz: above 80 MHz half the frequency comes first, for 1 us (RCC_CFGR.HPRE)",
                       old_hz, hz);
     }
-    fast_since_ns = sysclk_hz() > 80 * MHZ && hz <= 80 * MHZ + 5 * MHZ ? now : SOC_NEVER;
+    if (select != old_select) {
+        halved_from_ns = now;
+    }
 }
 
 /* --- Kernel clocks --- */
@@ -245,12 +247,12 @@ static void cr_write(uint32_t value) {
 }
 
 static void cfgr_write(uint32_t value) {
-    const uint32_t select = value & 3, old_hz = soc.hclk_hz;
+    const uint32_t select = value & 3, old_select = REG(CFGR) & 3, old_hz = soc.hclk_hz;
     if ((select == 3 && (!ready(PLL) || !(REG(PLLCFGR) >> 24 & 1))) || (select == 2 && !ready(HSE))) {
         soc_violation("RCC_CFGR = 0x%08X: the source of the system clock is not ready, or PLLREN is 0", value);
     }
     REG(CFGR) = value;
-    check_transition(old_hz);
+    check_transition(old_select, old_hz);
     clocks_changed();
 }
 
@@ -323,6 +325,6 @@ void rcc_reset(uint32_t cause) {
     ready_ns[LSE] = lse ? lse_ns : SOC_NEVER;
     REG(BDCR) = lse ? 1 : 0;
     REG(CSR) = cause & CSR_RESET_FLAGS;
-    fast_since_ns = SOC_NEVER;
+    halved_from_ns = 0;
     clocks_changed();
 }
