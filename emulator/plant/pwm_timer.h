@@ -2,7 +2,9 @@
 #ifndef PLANT_PWM_TIMER_H
 #define PLANT_PWM_TIMER_H
 
+#ifndef PWM_TIMER_TICK_NS /* another one for comparisons with a target of that clock */
 #define PWM_TIMER_TICK_NS 5
+#endif
 #define PWM_TIMER_CLOCK_HZ (1000000000 / PWM_TIMER_TICK_NS)
 
 #endif

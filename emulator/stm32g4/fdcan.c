@@ -234,6 +234,9 @@ static void acknowledge(unsigned fifo, uint32_t index) {
             break;
         }
     }
+    if (can.joined) {
+        can.bus.room(can.bus.context);
+    }
 }
 
 /* --- Transmission --- */

@@ -44,6 +44,7 @@ void timer_attach(void);
 void timer_reset(void);
 void timer_event(unsigned timer);
 void timer_input(unsigned pin, bool level);                      /* an input of a port has changed */
+bool timer_clears_by_zeros(uint32_t address);    /* a status register, to which ones may be written anywhere */
 void timer_break_changed(void);                                  /* a source of a break, or its routing, has changed */
 bool timer_output(unsigned pin, unsigned function, bool *level); /* a timer drives the pin; false: high impedance */
 void timer_fire(unsigned timer, unsigned event);                 /* for DMA requests and triggers, see timer.c */
@@ -92,6 +93,7 @@ typedef struct {
     void (*state)(void *context, unsigned *tec, unsigned *rec, bool *bus_off);
     void (*rejoin)(void *context);
     uint32_t (*bit_rate)(void *context);
+    void (*room)(void *context); /* a receive FIFO has room again */
     void *context;
 } fdcan_bus_t;
 void fdcan_attach(void);

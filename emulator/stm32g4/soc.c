@@ -159,7 +159,7 @@ void soc_write(uint32_t address, uint32_t value, unsigned size) {
     }
     /* Bits that no field has keep their reset value; read-only fields ignore what is written. */
     const uint32_t reserved = ~(row->writable | row->readable);
-    if ((value ^ row->reset) & reserved) {
+    if ((value ^ row->reset) & reserved && !timer_clears_by_zeros(at)) {
         soc_violation("write of %s (0x%08X), value 0x%X: reserved bits 0x%X", row->name, at, value,
                       (value ^ row->reset) & reserved);
     }

@@ -471,6 +471,15 @@ static tim_t *timer_of(uint32_t address) {
     soc_violation("0x%08X: no timer", address);
 }
 
+bool timer_clears_by_zeros(uint32_t address) {
+    for (unsigned i = 0; i < TIMERS; ++i) {
+        if (address == facts[i].base + TIM_SR) {
+            return true;
+        }
+    }
+    return false;
+}
+
 static uint32_t timer_read(uint32_t address) {
     tim_t *timer = timer_of(address);
     const uint32_t offset = address & 0x3FF;
