@@ -23,6 +23,7 @@ C_LAYERS = (
     "firmware/interrupts/", "firmware/comms/", "firmware/drive/", "firmware/layout/", "hal/stm32g4/",
     "emulator/plant/", "emulator/plant_library/", "emulator/plant_benchmark/", "emulator/fmi/", "emulator/rig/",
     "emulator/host/", "emulator/campaign/", "emulator/wasm/", "emulator/qemu/", "emulator/qemu/image/",
+    "emulator/stm32g4/",
 )  # fmt: skip
 INCLUDE_ROOTS = ("", "hal", "firmware", "emulator")
 FIRMWARE_FOR_THE_EMULATOR = {"firmware/drive/drive.h"}
