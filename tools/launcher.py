@@ -81,6 +81,7 @@ TARGET_DEPENDENCIES = {
         Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
+TARGET_DEPENDENCIES["stm32g4"] = TARGET_DEPENDENCIES["cortex-m4"][:2]
 WASM_DEPENDENCIES = (
     Dependency("clang-19", "compiler for WebAssembly", _tool("clang-19")),
     Dependency("lld-19", "its linker", _tool("wasm-ld-19")),
@@ -277,7 +278,8 @@ def host_targets(command: str, target: str) -> list[str]:
     targets += ["plant_benchmarks"] if command == "benchmark" else []
     targets += ["salient_campaign"] if command in ("campaign", "replay") else []
     targets += ["salient_reference"] if command == "compare" else []
-    targets += ["salient_target"] if target != "host" else []
+    if target != "host":
+        targets += ["salient_stm32g4" if target == "stm32g4" else "salient_target"]
     return targets
 
 

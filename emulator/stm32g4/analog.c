@@ -3,7 +3,6 @@
  * Comparators (RM0440, 24) and the converters that give their thresholds (22). Hysteresis, blanking and the response
  * time are left out; the reference is 3.3 V.
  */
-#include <stdio.h>
 #include <string.h>
 
 #include "stm32g4/peripherals.h"
@@ -61,18 +60,25 @@ static double threshold_V(unsigned comparator, uint32_t select) {
     return dac_V(sources[comparator][select - 4].dac, sources[comparator][select - 4].channel);
 }
 
-static double input_V(unsigned comparator, bool second) {
-    char name[8];
-    snprintf(name, sizeof name, "COMP%u", comparator + 1);
-    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-        if (strcmp(row->peripheral, name) == 0 && strcmp(row->signal, second ? "INP1" : "INP0") == 0) {
-            if (!gpio_is_analog(row->pin)) {
-                soc_violation("COMP_C%uCSR: its input %s is not in analogue mode", comparator + 1, gpio_name(row->pin));
-            }
-            return pin_V[row->pin];
+/* Pins of the inputs INP0 and INP1, found once. */
+static int input_pin(unsigned comparator, bool second) {
+    static int pins[COMPARATORS][2];
+    static bool found;
+    for (const pin_row_t *row = pins_first(); !found && row < pins_end(); ++row) {
+        if (strncmp(row->peripheral, "COMP", 4) == 0 && strncmp(row->signal, "INP", 3) == 0 && row->signal[3] != 0) {
+            pins[row->peripheral[4] - '1'][row->signal[3] - '0'] = (int)row->pin;
         }
     }
-    return 0.0;
+    found = true;
+    return pins[comparator][second];
+}
+
+static double input_V(unsigned comparator, bool second) {
+    const unsigned pin = (unsigned)input_pin(comparator, second);
+    if (!gpio_is_analog(pin)) {
+        soc_violation("COMP_C%uCSR: its input %s is not in analogue mode", comparator + 1, gpio_name(pin));
+    }
+    return pin_V[pin];
 }
 
 bool analog_comparator(unsigned comparator) {

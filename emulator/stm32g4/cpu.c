@@ -349,7 +349,7 @@ void cpu_memory_write(uint32_t address, uint32_t value, unsigned size) {
 void cpu_open(void) {
     check(uc_open(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS, &engine), "Unicorn");
     check(uc_ctl_set_cpu_model(engine, UC_CPU_ARM_CORTEX_M4), "Cortex-M4");
-    const int all = UC_PROT_ALL, code = UC_PROT_READ | UC_PROT_EXEC;
+    const uint32_t all = UC_PROT_ALL, code = UC_PROT_READ | UC_PROT_EXEC;
     check(uc_mem_map_ptr(engine, FLASH_BASE, FLASH_BANK_BYTES, code, soc.flash), "flash");
     check(uc_mem_map_ptr(engine, 0, FLASH_BANK_BYTES, code, soc.flash), "alias of the flash");
     check(uc_mmio_map(engine, FLASH_BASE + FLASH_BANK_BYTES, FLASH_BANK_BYTES, bank_2_read, NULL, bank_2_write, NULL),

@@ -45,18 +45,6 @@ static struct {
     bool refreshing;
 } gpio;
 
-static const pin_row_t pin_rows[] = {
-#include "stm32g4/pins.inc"
-};
-
-const pin_row_t *pins_first(void) {
-    return pin_rows;
-}
-
-const pin_row_t *pins_end(void) {
-    return pin_rows + sizeof pin_rows / sizeof pin_rows[0];
-}
-
 static uint32_t *port(unsigned pin, uint32_t offset) {
     return soc_word(GPIO + pin / 16 * PORT_BYTES + offset);
 }

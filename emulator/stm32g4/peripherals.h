@@ -43,9 +43,9 @@ typedef enum { TIM1, TIM2, TIM3, TIM4, TIM5, TIM6, TIM7, TIM8, TIMERS } timer_nu
 void timer_attach(void);
 void timer_reset(void);
 void timer_event(unsigned timer);
-void timer_input(unsigned pin, bool level);                      /* an input of a port has changed */
-bool timer_clears_by_zeros(uint32_t address);    /* a status register, to which ones may be written anywhere */
-void timer_break_changed(void);                                  /* a source of a break, or its routing, has changed */
+void timer_input(unsigned pin, bool level);   /* an input of a port has changed */
+bool timer_clears_by_zeros(uint32_t address); /* a status register, to which ones may be written anywhere */
+void timer_break_changed(void);               /* a source of a break, or its routing, has changed */
 bool timer_output(unsigned pin, unsigned function, bool *level); /* a timer drives the pin; false: high impedance */
 void timer_fire(unsigned timer, unsigned event);                 /* for DMA requests and triggers, see timer.c */
 

@@ -2,9 +2,6 @@
  *
  * Input side of the timers: triggers between timers, slave modes, capture, encoder with index (RM0440, 29.4).
  */
-#include <stdio.h>
-#include <string.h>
-
 #include "stm32g4/pins.h"
 #include "stm32g4/timer.h"
 
@@ -121,27 +118,12 @@ void timer_trigger_out(const tim_t *source, bool second) {
 
 /* --- Pins --- */
 
-/* Timer and signal of a pin in its present function; NULL: none. */
-static const pin_row_t *row_of(unsigned pin, const char *signal_start) {
-    const int function = gpio_function(pin);
-    for (const pin_row_t *row = pins_first(); function >= 0 && row < pins_end(); ++row) {
-        if (row->pin == pin && row->function == function && strncmp(row->peripheral, "TIM", 3) == 0 &&
-            strncmp(row->signal, signal_start, strlen(signal_start)) == 0) {
-            return row;
-        }
-    }
-    return NULL;
-}
-
-/* Level of an input of a timer, through polarity. */
-static bool input_level(const tim_t *timer, const char *signal) {
-    const unsigned number = (unsigned)(timer - timers) + 1;
-    char name[8];
-    snprintf(name, sizeof name, "TIM%u", number);
-    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-        if (strcmp(row->peripheral, name) == 0 && strcmp(row->signal, signal) == 0 &&
-            gpio_function(row->pin) == row->function) {
-            return gpio_level(row->pin);
+/* Level of an input of a timer. */
+static bool input_level(const tim_t *timer, pin_kind_t kind) {
+    const pin_list_t *list = pins_of_timer((unsigned)(timer - timers), kind);
+    for (unsigned i = 0; i < list->count; ++i) {
+        if (gpio_function(list->row[i]->pin) == list->row[i]->function) {
+            return gpio_level(list->row[i]->pin);
         }
     }
     return false;
@@ -167,7 +149,7 @@ static void index_step(tim_t *timer, bool down, bool before, bool after) {
 
 static bool index_selected(const tim_t *timer, bool a, bool b) {
     const uint32_t position = TIMER_REG(timer, TIM_ECR) >> 6 & 3;
-    const bool etr = input_level(timer, "ETR") != (TIMER_REG(timer, TIM_SMCR) >> 15 & 1);
+    const bool etr = input_level(timer, PIN_ETR) != (TIMER_REG(timer, TIM_SMCR) >> 15 & 1);
     return etr && position == ((b ? 1u : 0) | (a ? 2u : 0));
 }
 
@@ -175,7 +157,7 @@ static bool index_selected(const tim_t *timer, bool a, bool b) {
 static void encoder_edge(tim_t *timer, unsigned input, bool level) {
     const uint32_t sms = SMS(TIMER_REG(timer, TIM_SMCR));
     level = level != inverted(timer, input);
-    const bool other = input_level(timer, input ? "CH1" : "CH2") != inverted(timer, 1 - input);
+    const bool other = input_level(timer, input ? PIN_CH1 : PIN_CH2) != inverted(timer, 1 - input);
     const bool counts = sms == SMS_ENCODER_3 || sms == SMS_ENCODER_1 + input;
     if (!counts || !timer->runs) {
         return;
@@ -201,12 +183,13 @@ static void capture_edge(tim_t *timer, unsigned input, bool level) {
 }
 
 void timer_input(unsigned pin, bool level) {
-    const pin_row_t *row = row_of(pin, "CH");
-    if (!row || row->signal[3] == 'N') {
+    unsigned number, input;
+    bool complementary;
+    const int function = gpio_function(pin);
+    if (function < 0 || !pins_channel(pin, (unsigned)function, &number, &input, &complementary) || complementary) {
         return;
     }
-    tim_t *timer = &timers[row->peripheral[3] - '1'];
-    const unsigned input = (unsigned)(row->signal[2] - '1');
+    tim_t *timer = &timers[number];
     const uint32_t ts = TS(TIMER_REG(timer, TIM_SMCR));
     if (timer_is_encoder(timer) && input < 2) {
         encoder_edge(timer, input, level);

@@ -3,8 +3,6 @@
  * Output side of the timers: pins, edges up to the next update, breaks, lock (RM0440, 28.3.15 to 28.3.18, table "output
  * control bits for complementary channels with break feature").
  */
-#include <string.h>
-
 #include "stm32g4/pins.h"
 #include "stm32g4/timer.h"
 
@@ -31,15 +29,12 @@ typedef struct {
 } output_t;
 
 static bool output_of(unsigned pin, unsigned function, output_t *output) {
-    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-        if (row->pin == pin && row->function == (int)function && strncmp(row->peripheral, "TIM", 3) == 0 &&
-            strncmp(row->signal, "CH", 2) == 0) {
-            *output =
-                (output_t){&timers[row->peripheral[3] - '1'], (unsigned)(row->signal[2] - '1'), row->signal[3] == 'N'};
-            return timer_selection(output->timer, output->channel) == 0;
-        }
+    unsigned number;
+    if (!pins_channel(pin, function, &number, &output->channel, &output->complementary)) {
+        return false;
     }
-    return false;
+    output->timer = &timers[number];
+    return timer_selection(output->timer, output->channel) == 0;
 }
 
 /* How the output is driven at present: by the reference, at a level, or not at all. */
@@ -150,21 +145,18 @@ unsigned timer_edges(unsigned pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_M
 
 /* --- Breaks --- */
 
-static bool input_is_active(const tim_t *timer, unsigned input, bool *any) {
+static bool input_is_active(const tim_t *timer, unsigned input) {
     const uint32_t af = TIMER_REG(timer, input ? TIM_AF2 : TIM_AF1);
     const bool active_high = TIMER_REG(timer, TIM_BDTR) >> (input ? 25 : 13) & 1;
-    const char number = (char)('1' + (timer - timers));
+    const pin_list_t *list = pins_of_timer((unsigned)(timer - timers), input ? PIN_BKIN2 : PIN_BKIN);
     bool active = false;
-    for (const pin_row_t *row = pins_first(); af & 1 && row < pins_end(); ++row) {
-        if (strncmp(row->peripheral, "TIM", 3) == 0 && row->peripheral[3] == number &&
-            strcmp(row->signal, input ? "BKIN2" : "BKIN") == 0 && gpio_function(row->pin) == row->function) {
-            *any = true;
-            active = active || (gpio_level(row->pin) != (af >> 9 & 1)) == active_high;
+    for (unsigned i = 0; af & 1 && i < list->count; ++i) {
+        if (gpio_function(list->row[i]->pin) == list->row[i]->function) {
+            active = active || (gpio_level(list->row[i]->pin) != (af >> 9 & 1)) == active_high;
         }
     }
     for (unsigned i = 0; i < AF_COMPARATORS; ++i) {
         if (af >> (1 + i) & 1) {
-            *any = true;
             const bool swaps = i < 4 && af >> (10 + i) & 1;
             active = active || (analog_comparator(i) != swaps) == active_high;
         }
@@ -186,8 +178,7 @@ void timer_break_changed(void) {
         }
         for (unsigned input = 0; input < BREAK_INPUTS; ++input) {
             const bool enabled = TIMER_REG(timer, TIM_BDTR) & (input ? BDTR_BK2E : BDTR_BKE);
-            bool any = false;
-            if (enabled && input_is_active(timer, input, &any)) {
+            if (enabled && input_is_active(timer, input)) {
                 const uint32_t flag = input ? SR_B2IF : SR_BIF;
                 if (TIMER_REG(timer, TIM_BDTR) & BDTR_MOE || !(TIMER_REG(timer, TIM_SR) & flag)) {
                     timer_break(timer, flag);
