@@ -136,6 +136,13 @@ static bool check(const options_t *options) {
     return true;
 }
 
+/* REGISTER,CLEAR,SET: bits that each write of the register clears and sets. */
+static bool plant_mistake(const char *text) {
+    char name[32];
+    unsigned clear, set;
+    return sscanf(text, "%31[A-Z0-9_],%x,%x", name, &clear, &set) == 3 && soc_alter(name, clear, set);
+}
+
 int bench_run(int argc, char *argv[]) {
     static options_t options; /* the simulation keeps it */
     wiring_t wiring;
@@ -146,8 +153,17 @@ int bench_run(int argc, char *argv[]) {
     if (!wiring_read(&wiring, argv[2])) {
         return EXIT_USAGE;
     }
-    argv[2] = argv[0];
-    const options_result_t result = options_parse(&options, argc - 2, argv + 2);
+    int first = 2;
+    while (first + 2 < argc && strcmp(argv[first + 1], "--mistake") == 0) {
+        if (!plant_mistake(argv[first + 2])) {
+            fprintf(stderr, "salient_stm32g4: --mistake %s: must be REGISTER,CLEAR,SET with bits in hexadecimal\n",
+                    argv[first + 2]);
+            return EXIT_USAGE;
+        }
+        first += 2;
+    }
+    argv[first] = argv[0];
+    const options_result_t result = options_parse(&options, argc - first, argv + first);
     if (result != OPTIONS_RUN) {
         return result == OPTIONS_HELP ? 0 : EXIT_USAGE;
     }

@@ -50,8 +50,8 @@ ONES = 0xFFFFFFFF
 def bits_of(text: str, kind: str) -> int:
     """Bits of the fields in `impl R` or `impl W`."""
     mask = 0
-    for block in re.findall(rf"^impl {kind} \{{$(.*?)^\}}$", text, re.M | re.S):
-        for first, last in re.findall(r"^    ///Bits? (\d+)(?::(\d+))?", block, re.M):
+    for block in re.findall(rf"^impl {kind} \{{$(.*?)^\}}$", text, re.MULTILINE | re.DOTALL):
+        for first, last in re.findall(r"^    ///Bits? (\d+)(?::(\d+))?", block, re.MULTILINE):
             low, high = int(first), int(last or first)
             mask |= ((1 << (high - low + 1)) - 1) << low
     return mask
@@ -72,8 +72,8 @@ def block(folder: Path, base: int, prefix: str) -> list[tuple[str, int, int, int
     rows = []
     text = Path(f"{folder}.rs").read_text()
     aliases = {kind: folder / f"{module}.rs"
-               for kind, module in re.findall(r"^pub type (\w+) = crate::Reg<(\w+)::", text, re.M)}
-    for other, kind in re.findall(r"^pub use crate::stm32g474::(\w+)::([A-Z]\w*);", text, re.M):
+               for kind, module in re.findall(r"^pub type (\w+) = crate::Reg<(\w+)::", text, re.MULTILINE)}
+    for other, kind in re.findall(r"^pub use crate::stm32g474::(\w+)::([A-Z]\w*);", text, re.MULTILINE):
         aliases[kind] = folder.parent / other / f"{kind.lower()}.rs"
     for offset, name, kind in re.findall(
             r"///(0x[0-9a-f]+)(?:\.\.0x[0-9a-f]+)? - [^\n]*\n(?:    ///[^\n]*\n)*(?:    #[^\n]*\n)*"

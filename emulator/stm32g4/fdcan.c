@@ -391,8 +391,6 @@ static uint32_t queue_status(void) {
            (queue ? 0 : free | (can.requested ? (uint32_t)can.order[0] << 8 : 0));
 }
 
-/* --- Registers --- */
-
 static uint32_t fdcan_read(uint32_t address) {
     switch (address) {
     case RXF0S:

@@ -27,16 +27,18 @@ static uint16_t analog(void *context, unsigned adc, unsigned channel) {
 }
 
 static int usage(const char *program) {
-    printf("usage: %s IMAGE.elf --alone [--wire PIN=PIN] [--analog PIN=CODE] [--trace FILE PIN...] [--limit-us N]\n"
-           "       %s IMAGE.elf [--timed] OPTION...\n"
-           "  --alone              no bench: until BKPT, whose R0 is the exit code\n"
-           "  --wire PIN=PIN       joins two pins, as PA0=PB3\n"
-           "  --analog PIN=CODE    converters read this code of 12 bits at the pin, comparators its part of 3.3 V\n"
-           "  --trace FILE PIN...  writes time in cycles of HCLK, pin and level for each edge; the last option\n"
-           "  --limit-us N         ends the run with exit code 124 after this virtual time\n"
-           "  --timed              instructions take time; without it they take none, as on the host\n"
-           "  OPTION               as the host executable's; its --help lists them\n",
-           program, program);
+    printf(
+        "usage: %s IMAGE.elf --alone [--wire PIN=PIN] [--analog PIN=CODE] [--trace FILE PIN...] [--limit-us N]\n"
+        "       %s IMAGE.elf --wiring FILE [--mistake REGISTER,CLEAR,SET]... OPTION...\n"
+        "  --alone              no bench: until BKPT, whose R0 is the exit code\n"
+        "  --wire PIN=PIN       joins two pins, as PA0=PB3\n"
+        "  --analog PIN=CODE    converters read this code of 12 bits at the pin, comparators its part of 3.3 V\n"
+        "  --trace FILE PIN...  writes time in cycles of HCLK, pin and level for each edge; the last option\n"
+        "  --limit-us N         ends the run with exit code 124 after this virtual time\n"
+        "  --wiring FILE        on the bench: a signal and a pin in each line\n"
+        "  --mistake R,C,S      writes of the register clear and set bits (hexadecimal), as a mistake of the program\n"
+        "  OPTION               as the host executable's; its --help lists them\n",
+        program, program);
     return 0;
 }
 

@@ -51,6 +51,10 @@ static struct {
 static attachment_t attachments[ATTACHMENTS_MAX];
 static unsigned attachment_count;
 
+#define ALTERED_MAX 8
+static struct { uint32_t address, clear, set; } altered[ALTERED_MAX];
+static unsigned altered_count;
+
 static int page_of(uint32_t address) {
     unsigned first = 0;
     for (unsigned i = 0; i < sizeof ranges / sizeof ranges[0]; ++i) {
@@ -129,6 +133,27 @@ static const attachment_t *checked(uint32_t address, unsigned size, const char *
     return attachment;
 }
 
+bool soc_alter(const char *name, uint32_t clear, uint32_t set) {
+    for (unsigned i = 0; i < ROWS && altered_count < ALTERED_MAX; ++i) {
+        if (strcmp(rows[i].name, name) == 0) {
+            altered[altered_count].address = rows[i].address;
+            altered[altered_count].clear = clear;
+            altered[altered_count++].set = set;
+            return true;
+        }
+    }
+    return false;
+}
+
+static uint32_t with_mistake(uint32_t address, uint32_t value) {
+    for (unsigned i = 0; i < altered_count; ++i) {
+        if (altered[i].address == address) {
+            value = (value & ~altered[i].clear) | altered[i].set;
+        }
+    }
+    return value;
+}
+
 uint32_t soc_read(uint32_t address, unsigned size) {
     const attachment_t *attachment = checked(address & ~3u, 4, "read", 0);
     if (size != 4) {
@@ -154,6 +179,7 @@ void soc_write(uint32_t address, uint32_t value, unsigned size) {
         const uint32_t mask = ((1u << 8 * size) - 1) << shift;
         value = (row->readable ? REG(at) & ~mask : 0) | (value << shift & mask);
     }
+    value = with_mistake(at, value);
     if (row->writable == 0) {
         soc_violation("write of %s (0x%08X), value 0x%X: read-only", row->name, at, value);
     }

@@ -92,6 +92,10 @@ const char *soc_name(uint32_t address);
 uint32_t soc_read(uint32_t address, unsigned size);
 void soc_write(uint32_t address, uint32_t value, unsigned size);
 
+/* A mistake that the program does not have: bits that its writes of a register clear and set, to see what finds it.
+ * name: of the manual. False: no such register, or too many. */
+bool soc_alter(const char *name, uint32_t clear, uint32_t set);
+
 /* Functions of a peripheral: read returns the value; write receives a word whose reserved bits are checked. NULL: the
  * stored word alone. */
 typedef uint32_t (*soc_read_t)(uint32_t address);

@@ -108,6 +108,16 @@ unsigned timer_selection(const tim_t *timer, unsigned channel);
 void timer_flag(tim_t *timer, uint32_t flags);
 void timer_lines(const tim_t *timer);
 
+/* Counter now, and its direction; an encoder or external edges clock it. */
+uint32_t timer_count_now(const tim_t *timer, bool *down);
+bool timer_clocked_outside(const tim_t *timer);
+
+/* Update event: the shadow registers take what was written. by_counter: an overflow or underflow. */
+void timer_update(tim_t *timer, bool by_counter);
+
+/* OCxREF at a place; a rising edge may be a trigger. */
+void timer_follow_references(tim_t *timer, uint64_t place);
+
 /* Output side, timer_output.c: a write of BDTR, CR2, CCER or an alternate function register. */
 void timer_output_write(tim_t *timer, uint32_t offset, uint32_t value);
 void timer_break(tim_t *timer, uint32_t flag);

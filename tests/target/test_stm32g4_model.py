@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-
 from salient.paths import BUILD, ROOT
 
 SOURCES = ROOT / "tests" / "target" / "stm32g4"

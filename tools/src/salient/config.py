@@ -233,8 +233,8 @@ class BenchConfig(Conditions):
     follow_stdin: bool = _option(False, FLAG, "ends when standard input does")
     build: str = _option("host", WORD, "processor that runs the firmware: the host, one that QEMU emulates, "
                          "or a board's part in a register-level model",
-                         metavar="NAME", choices=(*TARGETS, BOARD_BUILD), commands=("sim", "demo", "run"), flag="target",
-                         argument=False)
+                         metavar="NAME", choices=(*TARGETS, BOARD_BUILD), commands=("sim", "demo", "run"),
+                         flag="target", argument=False)
     program: Path | None = _option(None, FILE, "executable of another project instead of the build's",
                                    argument=False)
     instructions: Path | None = _option(None, FILE, "instruction counts", argument=False)
