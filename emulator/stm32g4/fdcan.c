@@ -7,6 +7,7 @@
 
 #include "stm32g4/nvic.h"
 #include "stm32g4/peripherals.h"
+#include "stm32g4/pins.h"
 
 #define FDCAN 0x40006400u
 #define RAM 0x4000A400u
@@ -47,9 +48,9 @@
 #define IR_RF0L 0x04u
 #define IR_TC 0x80u
 #define IR_TFE 0x200u
-#define IR_EP (1u << 17)
-#define IR_EW (1u << 18)
-#define IR_BO (1u << 19)
+#define IR_EP 0x20000u
+#define IR_EW 0x40000u
+#define IR_BO 0x80000u
 #define BUFFERS 3u
 #define FIFO_ELEMENTS 3u
 #define ELEMENT_BYTES 72u
@@ -119,6 +120,9 @@ static void check_timing(void) {
         soc_violation("FDCAN1_NBTP = 0x%08X: the jump width is above segment 2", nbtp);
     }
     if (can.joined && !loops_back()) {
+        if (!pins_lead("FDCAN1", "RX") || !pins_lead("FDCAN1", "TX")) {
+            soc_violation("FDCAN1_CCCR.INIT = 0: no pin has its function RX, or TX");
+        }
         const uint32_t bus = can.bus.bit_rate(can.bus.context), own = bit_rate();
         const uint32_t difference = own > bus ? own - bus : bus - own;
         if ((uint64_t)difference * 1000 > (uint64_t)bus * TOLERANCE_PERMILLE) {
@@ -130,20 +134,10 @@ static void check_timing(void) {
 
 /* --- Receiving --- */
 
-/* 0, 1: FIFO; negative: rejected. */
+/* 0, 1: FIFO; -1: rejected; -2: disabled, or priority alone. */
 static int element_action(uint32_t configuration) {
-    switch (configuration) {
-    case 1:
-    case 5:
-        return 0;
-    case 2:
-    case 6:
-        return 1;
-    case 3:
-        return -1;
-    default:
-        return -2; /* disabled, or priority alone */
-    }
+    static const int8_t actions[8] = {-2, 0, 1, -1, -2, 0, 1, -2};
+    return actions[configuration & 7];
 }
 
 static bool matches(uint32_t kind, uint32_t first, uint32_t second, uint32_t identifier) {

@@ -70,3 +70,13 @@ bool pins_channel(unsigned pin, unsigned function, unsigned *timer, unsigned *ch
     *complementary = made.channel[pin][function].complementary;
     return made.channel[pin][function].known;
 }
+
+bool pins_lead(const char *peripheral, const char *signal) {
+    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
+        if (strcmp(row->peripheral, peripheral) == 0 && strcmp(row->signal, signal) == 0 &&
+            gpio_function(row->pin) == row->function) {
+            return true;
+        }
+    }
+    return false;
+}
