@@ -6,8 +6,8 @@
 #include <string.h>
 
 #include "stm32g4/nvic.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
 
 #define CONVERTERS 5
 #define ISR 0x00u

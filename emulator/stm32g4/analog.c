@@ -5,8 +5,8 @@
  */
 #include <string.h>
 
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
 
 #define COMP 0x40010200u
 #define COMPARATORS 7u

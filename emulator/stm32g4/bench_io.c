@@ -5,8 +5,8 @@
 #include <string.h>
 
 #include "stm32g4/flash.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
 
 #define CONVERTER_BITS 12
 #define VREF_V 3.3

@@ -6,8 +6,8 @@
 #include <string.h>
 
 #include "stm32g4/nvic.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
 
 #define FDCAN 0x40006400u
 #define RAM 0x4000A400u

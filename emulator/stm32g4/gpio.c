@@ -9,8 +9,8 @@
 #include <string.h>
 
 #include "stm32g4/nvic.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
 
 #define GPIO 0x48000000u
 #define PORT_BYTES 0x400u

@@ -10,9 +10,9 @@
 
 #include "stm32g4/bench.h"
 #include "stm32g4/cpu.h"
+#include "stm32g4/edge_file.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/peripherals.h"
-#include "stm32g4/pins.h"
-#include "stm32g4/trace.h"
 
 #define EXIT_USAGE_OF_ALONE 2
 #define CHANNELS 20
@@ -104,7 +104,7 @@ static int alone(int argc, char *argv[]) {
                 }
                 pins[count++] = (unsigned)pin;
             }
-            if (!trace_open(value, pins, count)) {
+            if (!edge_file_open(value, pins, count)) {
                 return mistake("--trace", value);
             }
             break;
@@ -133,7 +133,7 @@ static int alone(int argc, char *argv[]) {
             break;
         }
     }
-    trace_close();
+    edge_file_close();
     fflush(stdout);
     return cpu.exit_code;
 }

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
-#include "stm32g4/pins.h"
+#include "stm32g4/part_pins.h"
 
 #include <string.h>
 

@@ -2,7 +2,7 @@
 #include "stm32g4/timer.h"
 
 #include "stm32g4/nvic.h"
-#include "stm32g4/pins.h"
+#include "stm32g4/part_pins.h"
 
 tim_t timers[TIMERS];
 

@@ -132,7 +132,7 @@ void timer_check_slave(const tim_t *timer, uint32_t value); /* of SMCR */
 
 /* Counter from now on at a place, with events. */
 void timer_restart(tim_t *timer, uint64_t place);
-void timer_start(tim_t *timer);
+void timer_enable(tim_t *timer);
 void timer_plan(tim_t *timer); /* events, after a change of what they depend on */
 void timer_count_external(tim_t *timer, bool down);
 

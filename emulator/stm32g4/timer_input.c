@@ -2,7 +2,7 @@
  *
  * Input side of the timers: triggers between timers, slave modes, capture, encoder with index (RM0440, 29.4).
  */
-#include "stm32g4/pins.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/timer.h"
 
 #define SMS(smcr) (((smcr)&7u) | ((smcr) >> 13 & 8u))
@@ -81,11 +81,11 @@ void timer_input_trigger(tim_t *timer) {
         soc_write(timer->facts->base + TIM_EGR, 1, 4);
         break;
     case SMS_TRIGGER:
-        timer_start(timer);
+        timer_enable(timer);
         break;
     case SMS_RESET_TRIGGER:
         soc_write(timer->facts->base + TIM_EGR, 1, 4);
-        timer_start(timer);
+        timer_enable(timer);
         break;
     case SMS_CLOCK:
         if (timer->runs) {

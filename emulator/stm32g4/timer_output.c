@@ -3,7 +3,7 @@
  * Output side of the timers: pins, edges up to the next update, breaks, lock (RM0440, 28.3.15 to 28.3.18, table "output
  * control bits for complementary channels with break feature").
  */
-#include "stm32g4/pins.h"
+#include "stm32g4/part_pins.h"
 #include "stm32g4/timer.h"
 
 #define BDTR_UNMODELLED 0x3C000000u /* bidirectional breaks */

@@ -20,7 +20,7 @@ static const timer_facts_t facts[TIMERS] = {
     [TIM8] = {0x40013400, true, false, false, true, IRQ(44), IRQ(43), IRQ(45), IRQ(46), 53, 49},
 };
 
-void timer_start(tim_t *timer) {
+void timer_enable(tim_t *timer) {
     if (timer->runs) {
         return;
     }
@@ -57,7 +57,7 @@ static void control_write(tim_t *timer, uint32_t value) {
     }
     TIMER_REG(timer, TIM_CR1) = (value & ~CR1_CEN) | (old & value & CR1_CEN);
     if (value & CR1_CEN && !(old & CR1_CEN)) {
-        timer_start(timer);
+        timer_enable(timer);
     } else {
         timer_plan(timer);
         timer_outputs_changed();

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
-#include "stm32g4/trace.h"
+#include "stm32g4/edge_file.h"
 
 #include <stdio.h>
 
@@ -38,7 +38,7 @@ static void changed(void *context) {
     }
 }
 
-bool trace_open(const char *path, const unsigned of_pins[], unsigned count) {
+bool edge_file_open(const char *path, const unsigned of_pins[], unsigned count) {
     file = fopen(path, "w");
     if (!file) {
         return false;
@@ -51,7 +51,7 @@ bool trace_open(const char *path, const unsigned of_pins[], unsigned count) {
     return true;
 }
 
-void trace_close(void) {
+void edge_file_close(void) {
     if (file) {
         for (unsigned i = 0; i < pin_count; ++i) {
             write_until(i, soc.now);

@@ -2,8 +2,8 @@
  *
  * Table of the part's pins: peripheral, signal, alternate function; triggers of the converters.
  */
-#ifndef STM32G4_PINS_H
-#define STM32G4_PINS_H
+#ifndef STM32G4_PART_PINS_H
+#define STM32G4_PART_PINS_H
 
 #include <stdbool.h>
 
