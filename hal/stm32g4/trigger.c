@@ -12,8 +12,7 @@
 
 #define PRIORITY_CONTROL 0x00
 #define PRIORITY_DEFERRED 0x80
-#define PRIORITY_CAN 0xC0 /* below both: it shares nothing with them, and a FIFO of 3 frames waits 141 us at 1 Mbit/s  \
-                           */
+#define PRIORITY_CAN 0xC0 /* it shares nothing with them; a FIFO of 3 frames waits 141 us at 1 Mbit/s */
 
 uint16_t trigger_count(void) {
     return (uint16_t)TIM_CNT(TIM4_BASE);
