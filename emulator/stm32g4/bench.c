@@ -76,11 +76,12 @@ static void boot(void) {
         }
     }
     const uint64_t length_ns = period_cycles() * NS_PER_S / soc.hclk_hz;
-    if (length_ns % (2 * PWM_TIMER_TICK_NS) != 0) {
-        soc_violation("control period of %llu ns: not a whole number of the plant's ticks of %d ns",
-                      (unsigned long long)length_ns, PWM_TIMER_TICK_NS);
+    const uint64_t ticks = pwm_timer_ticks(length_ns) / 2;
+    if (pwm_timer_ns(2 * ticks) != length_ns || ticks > UINT16_MAX) {
+        soc_violation("control period of %llu ns: not a whole number of the plant's ticks, or too long",
+                      (unsigned long long)length_ns);
     }
-    board_pwm_start(board, (uint16_t)(length_ns / (2 * PWM_TIMER_TICK_NS)));
+    board_pwm_start(board, (uint16_t)ticks);
 }
 
 static void follow_watchdog(void) {

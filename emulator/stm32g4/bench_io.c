@@ -226,6 +226,11 @@ static unsigned edges_of(int pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_MA
     return count;
 }
 
+/* From the start of the period, to the nearest nanosecond, as the plant's timer has it. */
+static uint32_t delay_ns(uint64_t cycles) {
+    return (uint32_t)((cycles * UINT64_C(1000000000) + soc.hclk_hz / 2) / soc.hclk_hz);
+}
+
 static void pattern_of(half_bridge_pattern_t *pattern, unsigned phase, uint64_t to) {
     timer_edge_t lower[TIMER_EDGES_MAX], upper[TIMER_EDGES_MAX];
     const unsigned lowers = edges_of(wiring.lower[phase], to, lower), uppers = edges_of(wiring.upper[phase], to, upper);
@@ -244,7 +249,7 @@ static void pattern_of(half_bridge_pattern_t *pattern, unsigned phase, uint64_t 
         if (pattern->count == HALF_BRIDGE_EDGES_MAX) {
             soc_violation("gates of phase %c: more than two edges of a switch in a control period", 'a' + (int)phase);
         }
-        pattern->delay_ns[pattern->count] = (uint32_t)(soc_ns(at) - soc_ns(soc.now));
+        pattern->delay_ns[pattern->count] = delay_ns(at - soc.now);
         pattern->switches[pattern->count++] = now;
     }
 }

@@ -13,9 +13,9 @@ enum { INITIATED_UPLOAD = 0xC2, ENDS = 0xC1, INITIATED_DOWNLOAD = 0xA0, CONFIRME
 
 COLD uint16_t canopen_sdo_crc(uint16_t crc, const uint8_t *data, unsigned count) {
     for (unsigned i = 0; i < count; i++) {
-        crc = (uint16_t)(crc ^ data[i] << 8);
+        crc = (uint16_t)(crc ^ (uint32_t)data[i] << 8);
         for (unsigned bit = 0; bit < 8u; bit++) {
-            crc = (uint16_t)(crc << 1 ^ ((crc & 0x8000u) != 0 ? POLYNOMIAL : 0u));
+            crc = (uint16_t)((uint32_t)crc << 1 ^ ((crc & 0x8000u) != 0 ? POLYNOMIAL : 0u));
         }
     }
     return crc;

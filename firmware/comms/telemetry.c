@@ -59,12 +59,12 @@ static void enqueue(telemetry_t *telemetry, const drive_telemetry_message_t *mes
 /* Messages of a group that are due in this cycle; advances their countdowns. */
 static unsigned due_messages(telemetry_t *telemetry, drive_telemetry_group_t group,
                              const drive_telemetry_message_t *due[DRIVE_TELEMETRY_MESSAGES]) {
+    const bool active = group == DRIVE_TELEMETRY_GROUP_POSITION ? telemetry->position_used : telemetry->in_fault;
     unsigned count = 0;
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
         const bool settable = message->rate != DRIVE_TELEMETRY_RATE_FIXED;
-        if (message->group == group && (telemetry->in_fault || !message->if_active) &&
-            (telemetry->position_used || group != DRIVE_TELEMETRY_GROUP_POSITION) &&
+        if (message->group == group && (active || !message->if_active) &&
             machine_tables.phases > message->phases_above &&
             count_down(&telemetry->countdown[i], settable ? telemetry->period[message->rate] : message->period)) {
             due[count++] = message;

@@ -48,7 +48,7 @@ static void comparators_init(void) {
     COMP_C2CSR = COMP_C3CSR = COMP_C4CSR = COMP_C7CSR = COMP_CSR | COMP_C2CSR_LOCK;
 }
 
-/* One channel per timer: a request may not serve two channels. */
+/* One channel per timer: a request of the multiplexer may not serve two channels. */
 static void unrenewed_init(void) {
     const uint32_t mode = DMA_CCR1_DIR | DMA_CCR1_CIRC | PUT(DMA_CCR1_PSIZE, WORD) | PUT(DMA_CCR1_MSIZE, WORD) |
                           PUT(DMA_CCR1_PL, PRIORITY_VERY_HIGH);
@@ -60,6 +60,7 @@ static void unrenewed_init(void) {
     DMA_CMAR1 = DMA_CMAR2 = (uint32_t)(uintptr_t)&break_word;
     DMA_CCR1 = mode | DMA_CCR1_EN;
     DMA_CCR2 = mode | DMA_CCR1_EN;
+    TIM_SMCR(TIM3_BASE) = PUT(TIM_SMCR_TS, TS_ITR0); /* while no mode uses it */
     TIM_SMCR(TIM3_BASE) = PUT(TIM_SMCR_TS, TS_ITR0) | PUT(TIM_SMCR_SMS, SMS_EXTERNAL_CLOCK);
     TIM_CCR1(TIM3_BASE) = TIM_CCR2(TIM3_BASE) = PERIODS_UNRENEWED;
     TIM_SR(TIM3_BASE) = 0;

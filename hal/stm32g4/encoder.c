@@ -13,6 +13,7 @@
 
 /* Before everything that takes long: an encoder that counts to its absolute position does so after its own start. */
 void encoder_init(void) {
+    TIM_SMCR(TIM2_BASE) = PUT(TIM_SMCR_TS, TS_ITR0); /* while no mode uses it */
     TIM_SMCR(TIM2_BASE) = PUT(TIM_SMCR_TS, TS_ITR0) | PUT(TIM_SMCR_SMS, SMS_ENCODER_BOTH);
     TIM_CCMR1(TIM2_BASE) = PUT(TIM_CCMR1_CC1S, CCS_TI) | PUT(TIM_CCMR1_IC1F, FILTER_4) | PUT(TIM_CCMR1_CC2S, CCS_TI) |
                            PUT(TIM_CCMR1_IC2F, FILTER_4);

@@ -6,8 +6,8 @@
  * around the overflow. 0 and ARR are off and on for the whole period in both.
  *
  * Both timers are in trigger mode on TIM3's enable, and start in the same cycle. Their own update is the trigger of
- * ADC, encoder and counters only: with it as the start, the update event that loads the repetition counter would start
- * TIM8 ahead of TIM1.
+ * ADC, encoder and counters only: with it as the start, UG, which loads the repetition counter, would start TIM8 ahead
+ * of TIM1.
  */
 #include "hal_memory.h"
 #include "hal_pwm.h"
@@ -45,8 +45,14 @@ void pwm_init(void) {
         TIM_RCR(tim) = 1; /* before the start: updates at the underflow only */
         TIM_BDTR(tim) = BDTR_CLOSED;
         TIM_CCER(tim) = CCER_OUTPUTS;
+        TIM_SMCR(tim) = PUT(TIM_SMCR_TS, TS_ITR2); /* while no mode uses it */
         TIM_SMCR(tim) = PUT(TIM_SMCR_TS, TS_ITR2) | PUT(TIM_SMCR_SMS, SMS_TRIGGER);
+        /* Loads the repetition counter. UG also leaves as TRGO and TRGO2: here, before anything is armed that they
+         * trigger (adc_init, hal_pwm_start). */
+        TIM_EGR(tim) = TIM_EGR_UG;
+        TIM_SR(tim) = 0;
     }
+    TIM_CR2(TIM1_BASE) = PUT(TIM_CR2_MMS, MMS_UPDATE) | PUT(TIM_CR2_MMS2, MMS_UPDATE);
 }
 
 uint32_t hal_pwm_clock_hz(const hal_t *hal) {
@@ -60,11 +66,6 @@ void hal_pwm_start(hal_t *hal, uint16_t period_ticks) {
         TIM_ARR(timers[i]) = period_ticks;
     }
     hal_pwm_open_all(hal);
-    for (unsigned i = 0; i < TIMERS; i++) {
-        TIM_EGR(timers[i]) = TIM_EGR_UG; /* loads the repetition counter; no timer listens to it yet */
-        TIM_SR(timers[i]) = 0;
-    }
-    TIM_CR2(TIM1_BASE) = PUT(TIM_CR2_MMS, MMS_UPDATE) | PUT(TIM_CR2_MMS2, MMS_UPDATE);
     trigger_start();
     break_clear();
     TIM_CR2(TIM3_BASE) = PUT(TIM_CR2_MMS, MMS_ENABLE);

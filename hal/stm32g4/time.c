@@ -36,7 +36,7 @@ uint32_t hal_time_us(const hal_t *hal) {
     return TIM_CNT(TIM5_BASE);
 }
 
-/* Of a counter in another clock domain two equal readings are right (RM0440, LPTIM: counter register). */
+/* Two equal readings of a counter in another clock domain are right (RM0440, LPTIM: counter register). */
 static uint16_t reference_count(void) {
     uint32_t count = LPTIM_CNT;
     for (;;) {

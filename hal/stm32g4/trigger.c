@@ -12,14 +12,14 @@
 
 #define PRIORITY_CONTROL 0x00
 #define PRIORITY_DEFERRED 0x80
-#define PRIORITY_CAN 0xC0 /* below both: it shares nothing with them, and a FIFO of 3 frames waits 141 us at 1 Mbit/s  \
-                           */
+#define PRIORITY_CAN 0xC0 /* it shares nothing with them; a FIFO of 3 frames waits 141 us at 1 Mbit/s */
 
 uint16_t trigger_count(void) {
     return (uint16_t)TIM_CNT(TIM4_BASE);
 }
 
 void trigger_start(void) {
+    TIM_SMCR(TIM4_BASE) = PUT(TIM_SMCR_TS, TS_ITR0); /* while no mode uses it */
     TIM_SMCR(TIM4_BASE) = PUT(TIM_SMCR_TS, TS_ITR0) | PUT(TIM_SMCR_SMS, SMS_EXTERNAL_CLOCK);
     TIM_CNT(TIM4_BASE) = 0;
     TIM_CR1(TIM4_BASE) = TIM_CR1_CEN;
@@ -48,11 +48,11 @@ bool control_begin(hal_t *hal) {
         return false;
     }
     hal->trigger = trigger;
+    adc_convert_temperature(hal); /* now: at the next trigger it has ended, and delays no sample */
     return true;
 }
 
 void control_end(hal_t *hal) {
-    adc_convert_temperature(hal);
     hal->trigger_at_end = trigger_count();
 }
 

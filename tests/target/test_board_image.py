@@ -145,7 +145,8 @@ def tools_alone(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "suffix", "expected"), [
-    ("openocd", "elf", "program {%s} verify reset exit"), ("openocd", "bin", "program {%s} 0x08000000 verify reset exit"),
+    ("openocd", "elf", "program {%s} verify reset exit"),
+    ("openocd", "bin", "program {%s} 0x08000000 verify reset exit"),
     ("st-flash", "hex", "ihex\nwrite\n%s"), ("st-flash", "bin", "write\n%s\n0x08000000"),
 ])
 def test_flash_calls_the_program_that_is_there(monkeypatch, capsys, built, tmp_path, name, suffix, expected):

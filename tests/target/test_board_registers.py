@@ -34,8 +34,8 @@ def test_header_agrees_with_both_crates():
 
 def test_both_crates_describe_most_of_it():
     """A fact that one crate lacks rests on the other alone: the decided ones and few more."""
-    by_source = {source: {block for block, registers in FACTS_OF_THE_CRATES[source]["registers"].items() if registers}
-                 for source in ("metapac", "svd")}
+    by_source = {source: {block for block, registers in FACTS_OF_THE_CRATES[source]["registers"].items()
+                          if registers} for source in ("metapac", "svd")}
     blocks = {register.block for register in WHOLE.registers}
     assert by_source["svd"] == blocks
     assert blocks - by_source["metapac"] == {"COMP", "LPTIM"}  # comparators are instances of one register there

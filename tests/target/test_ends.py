@@ -62,7 +62,8 @@ def make_image(request, tmp_path: Path) -> Callable[[int], Path]:
         mailbox.write_text(text)
         drive, image = tmp_path / "drive.c", tmp_path / "image.elf"
         drive.write_text(DRIVE)
-        folders = [tmp_path, hal, ROOT / "firmware", ROOT / "emulator", BUILD / "cortex-m4" / "firmware" / "codec"]
+        folders = [tmp_path, hal, ROOT / "firmware", ROOT / "emulator",
+                   *(BUILD / "cortex-m4" / "firmware" / generated for generated in ("codec", "dictionary"))]
         sources = [ROOT / "emulator/qemu/image/main.c", *sorted((hal / "qemu").glob("*.c")),
                    *sorted((hal / "qemu" / request.param).glob("*.c"))]
         scripts = [hal / "qemu" / request.param / "memory.ld", hal / "qemu" / "sections.ld"]

@@ -86,6 +86,8 @@ KINDS = {
     "command": Kind(f"command speed 300 --duration-s 0.5 {_BUS}", bus=True),
     "view": Kind(f"view {_BUS}", endless=True, bus=True),
     "scope": Kind(f"scope {_BUS} --out {{folder}}/scope", bus=True),
+    "identify": Kind("identify --machine saturating --true-machine linear_cosine --bins 4 --repeats 1 "
+                     "--out {folder}/identified/motor.toml"),
     "parameters": Kind(f"parameters save {{folder}}/saved.toml {_BUS}", bus=True),
     "machine": Kind("machine saturating --out {folder}/machine"),
     "compare": Kind("compare speeds --quick --samples 1 --resume --out {folder}/compare"),

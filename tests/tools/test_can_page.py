@@ -185,8 +185,8 @@ def test_limits_are_those_of_the_firmware() -> None:
 def test_another_byte_anywhere_is_found() -> None:
     """Each byte of each frame, identifier, data ID and parameter of the CRC, one at a time."""
     places = [match.start(1) + offset for match in HEX_BYTES.finditer(PAGE) for offset in range(0, len(match[1]), 3)]
-    rows = re.compile(r"^\| (?:`(?:DRIVE_(?:COMMAND|TORQUE|POSITION|IDENTIFY|ARM)|PARAMETER)\w*`|host|polynomial|initial|final|CRC of).*",
-                      re.MULTILINE)
+    rows = re.compile(r"^\| (?:`(?:DRIVE_(?:COMMAND|TORQUE|POSITION|IDENTIFY|ARM)|PARAMETER)\w*`|host|polynomial"
+                      r"|initial|final|CRC of).*", re.MULTILINE)
     places += [row.start() + match.end(1) - 2 for row in rows.finditer(PAGE)
                for match in re.finditer(r"`(0x[0-9A-F]{3,8})`", row[0])
                if "COUNTERS" not in row[0]]

@@ -234,11 +234,12 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
         action.add_argument(flag_of(name), dest=name, type=_option_type(name), default=DEFAULTS[name],
                             metavar=OPTIONS[name].metavar, help=description(name))
     action.add_argument("--clock", type=_one_of(BOARD_CLOCKS), default=BOARD_CLOCKS[0], metavar="MHZ",
-                        help=f"clock of processor and timers: {either(BOARD_CLOCKS)}, the second for comparison with the "
-                        f"emulator (default {BOARD_CLOCKS[0]})")
+                        help=f"clock of processor and timers: {either(BOARD_CLOCKS)}, the second for comparison with "
+                        f"the emulator (default {BOARD_CLOCKS[0]})")
     action.add_argument("--encoder", type=_one_of(BOARD_ENCODERS), default=BOARD_ENCODERS[0], metavar="KIND",
-                        help=f"{either(BOARD_ENCODERS)}: it counts to its absolute position at power-up, or is absolute "
-                        f"after its index has passed, before which no switch closes (default {BOARD_ENCODERS[0]})")
+                        help=f"{either(BOARD_ENCODERS)}: it counts to its absolute position at power-up, or is "
+                        "absolute after its index has passed, before which no switch closes (default "
+                        f"{BOARD_ENCODERS[0]})")
     action.add_argument("--out", type=Path, default=OUT / "board", metavar="DIR", help="folder (default %(default)s)")
     text = "write an image into the flash of a board, by OpenOCD or st-flash"
     action = actions.add_parser("flash", help=text, description=text, prog=f"{COMMAND} board flash")

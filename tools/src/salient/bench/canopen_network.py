@@ -36,9 +36,12 @@ def network_on(session: Session) -> Iterator[Any]:
         def __init__(self) -> None:
             super().__init__()
             self._heard, self._responds = len(session.log), False
+            self._own: list[tuple[int, bytes]] = []  # sent, and not heard yet
 
         def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-            """As of the package; returns when a response can be there."""
+            """As of the package; returns when a response can be there. The frame itself is not handed on: the package
+            would take it for another master's, and overwrite what the PDO is to send next."""
+            self._own.append((can_id, bytes(data)))
             session.send(can.Message(arbitration_id=can_id, is_extended_id=False, is_remote_frame=remote,
                                      data=b"" if remote else bytes(data), dlc=len(data)))
             self.run_for(RESPONSE_S)
@@ -52,7 +55,10 @@ def network_on(session: Session) -> Iterator[Any]:
             while self._heard < len(session.log):
                 time_ns, message = session.log[self._heard]
                 self._heard += 1
-                if not message.is_extended_id and not message.is_remote_frame:
+                frame = (message.arbitration_id, bytes(message.data))
+                if frame in self._own:
+                    self._own.remove(frame)
+                elif not message.is_extended_id and not message.is_remote_frame:
                     self.notify(message.arbitration_id, bytearray(message.data), time_ns / 1e9)
 
     yield Network()

@@ -25,7 +25,7 @@ FLASH_BEGIN, FLASH_BYTES = 0x08000000, 256 * 1024
 """Bank 1; the parameters are in bank 2."""
 RAM_BEGIN, RAM_BYTES = 0x20000000, 128 * 1024
 CAN_QUANTA = 10
-"""Of a bit: PRESCALER in hal/stm32g4/can.c must be a whole number up to 512."""
+"""Quanta of a bit: PRESCALER in hal/stm32g4/can.c must be a whole number up to 512."""
 _PARTS = ("drive_codec", "salient_firmware")
 _OPENOCD = ("-f", "board/st_nucleo_g4.cfg")
 SUFFIXES = (".elf", ".hex", ".bin")
@@ -112,7 +112,8 @@ def flash(file: Path) -> int:
                     else ["write", str(file), f"0x{FLASH_BEGIN:08x}"])
     else:
         raise UsageError("neither openocd nor st-flash is there: install the Debian package openocd or stlink-tools")
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                          text=True)
     if done.returncode != 0:
         lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
         reasons = [line for line in lines if "error" in line.lower()] or lines[-1:] or ["no output"]
@@ -129,7 +130,8 @@ def check_image(file: Path) -> None:
     stack, start = struct.unpack("<II", vectors) if len(vectors) == 8 else (0, 0)
     in_ram = RAM_BEGIN < stack <= RAM_BEGIN + RAM_BYTES and stack % 8 == 0
     if not in_ram or not (FLASH_BEGIN <= start < FLASH_BEGIN + FLASH_BYTES and start & 1):
-        raise UsageError(f"{file}: no image for the NUCLEO-G474RE: its vector table begins with {vectors.hex() or 'nothing'}")
+        raise UsageError(f"{file}: no image for the NUCLEO-G474RE: its vector table begins with "
+                         f"{vectors.hex() or 'nothing'}")
 
 
 def _first_bytes(file: Path) -> bytes:

@@ -2,8 +2,8 @@
 
     python -m salient.board.crates FOLDER
 
-reads the crates `stm32-metapac` 21.0.0 and `stm32g4` 0.16.0 below a folder (that of `cargo vendor`, or the registry
-folder of `cargo fetch`) and writes hal/stm32g4/facts.json: addresses, offsets, fields, reset values and access of the
+reads the crates `stm32-metapac` 21.0.0 and `stm32g4` 0.16.0 below a folder (of `cargo vendor`, or the registry's
+of `cargo fetch`) and writes hal/stm32g4/facts.json: addresses, offsets, fields, reset values and access of the
 registers in the header, interrupt numbers, and the functions of the pins. The crates take 310 MB and are not needed for
 the check itself.
 """
@@ -58,6 +58,11 @@ _FIELD = re.compile(
     r"pub const fn (\w+)\(&self(?:, n: usize)?\)[^{]*\{\s*(?:assert!\(n < (\d+)usize\);\s*)?"
     r"(?:let offs = (\d+)usize \+ n \* (\d+)usize;\s*)?let val = \(self\.0 >> (?:(\d+)usize|offs)\) & (0x[0-9a-f]+);")
 
+_DOCUMENTED = r"[^\n]*(?:\n *///[^\n]*)*\n\s*#\[inline\(always\)\]\n\s*pub "
+_ACCESSOR = re.compile(r"///(0x[0-9a-f]+)(?:\.\.(0x[0-9a-f]+))? - " + _DOCUMENTED
+                       + r"const fn (\w+)\(&self(, n: usize)?\) -> &([\w:]+) \{")
+_BITS = re.compile(r"///Bits? (\d+)(?::(\d+))? - " + _DOCUMENTED + r"(?:const )?fn (\w+)\(&(?:mut )?self\)")
+
 
 def _expand(name: str, count: str | None, start: int, step: str | None) -> list[tuple[str, int]]:
     """The elements of an array, or the single one."""
@@ -66,8 +71,13 @@ def _expand(name: str, count: str | None, start: int, step: str | None) -> list[
     return [(f"{name}[{n}]", start + n * int(step or 0)) for n in range(int(count))]
 
 
+def _interrupts(text: str) -> dict[str, int]:
+    """Numbers by name, of the enumeration that both crates have."""
+    return {name: int(number) for name, number in re.findall(r"^    (\w+) = (\d+),$", text, re.MULTILINE)}
+
+
 def _body(text: str, head: str) -> str:
-    """What follows a head up to the closing brace at its indentation."""
+    """The text after a head up to the closing brace at its indentation."""
     found = re.search(rf"^( *){re.escape(head)} \{{\n", text, re.MULTILINE)
     if found is None:
         return ""
@@ -83,7 +93,7 @@ class Metapac:
         chip = (self._source / "chips" / CHIP / "pac.rs").read_text()
         self.addresses = {name: int(address.replace("_", ""), 16) for name, address in
                           re.findall(r"pub const (\w+): [^=]*= unsafe \{[^(]*\((0x[0-9a-f_]+)usize as _\)", chip)}
-        self.interrupts = {name: int(number) for name, number in re.findall(r"^    (\w+) = (\d+),$", chip, re.MULTILINE)}
+        self.interrupts = _interrupts(chip)
         included = re.search(r'include!\("\.\./(metadata_\d+\.rs)"\)',
                              (self._source / "chips" / CHIP / "metadata.rs").read_text())
         if included is None:
@@ -138,7 +148,7 @@ class Svd:
         text = (self._source / "mod.rs").read_text()
         self.addresses = {name: int(address.replace("_", ""), 16) for name, address in
                           re.findall(r"pub type (\w+) = crate::Periph<[\w:]+, (0x[0-9a-f_]+)>", text)}
-        self.interrupts = {name: int(number) for name, number in re.findall(r"^    (\w+) = (\d+),$", text, re.MULTILINE)}
+        self.interrupts = _interrupts(text)
 
     def registers(self, block: str) -> dict[str, dict[str, Any]]:
         """By name: offset, access, reset value, bits that a one or a zero clears, fields."""
@@ -146,11 +156,9 @@ class Svd:
         return self._block(module, (self._source / f"{module}.rs").read_text())
 
     def _block(self, module: str, text: str, base: int = 0) -> dict[str, dict[str, Any]]:
-        """Registers, elements of arrays of registers, and those of clusters."""
-        found = {}
-        for begin, end, name, index, kind in re.findall(
-                r"///(0x[0-9a-f]+)(?:\.\.(0x[0-9a-f]+))? - [^\n]*(?:\n *///[^\n]*)*\n\s*#\[inline\(always\)\]\n\s*"
-                r"pub const fn (\w+)\(&self(, n: usize)?\) -> &([\w:]+) \{", text):
+        """Registers, elements of arrays of registers, and registers of clusters."""
+        found: dict[str, dict[str, Any]] = {}
+        for begin, end, name, index, kind in _ACCESSOR.findall(text):
             offset = base + int(begin, 16)
             cluster = self._source / module / f"{kind.lower()}.rs"
             if "::" not in kind and f"pub use self::{kind.lower()}::{kind};" in text and cluster.exists():
@@ -173,9 +181,8 @@ class Svd:
         one, zero = (re.search(rf"const {name}_TO_MODIFY_FIELDS_BITMAP: u\d+ = (0x[0-9a-f_]+|\d+)", content)
                      for name in ("ONE", "ZERO"))
         fields = {}
-        for last_or_first, last, name in re.findall(
-                r"///Bits? (\d+)(?::(\d+))? - [^\n]*(?:\n *///[^\n]*)*\n\s*#\[inline\(always\)\]\n\s*pub (?:const )?fn (\w+)\(&(?:mut )?self\)", content):
-            first = int(last_or_first)
+        for begin, last, name in _BITS.findall(content):
+            first = int(begin)
             fields[name] = [name, first, int(last or first) - first + 1]
         return {"access": "r" * readable + "w" * writable, "reset": int(reset[1].replace("_", ""), 0) if reset else 0,
                 "one_clears": int(one[1].replace("_", ""), 0) if one else 0,
@@ -193,7 +200,8 @@ def collect(folder: Path, header: Header, pins: set[str]) -> dict[str, Any]:
         facts[name] = {
             "addresses": {key: source.addresses[found] for key in sorted(header.bases)
                           if (found := OTHER_NAMES.get(key, key) if name == "metapac" else key) in source.addresses},
-            "interrupts": {key: source.interrupts[key] for key in sorted(header.interrupts) if key in source.interrupts},
+            "interrupts": {key: source.interrupts[key] for key in sorted(header.interrupts)
+                           if key in source.interrupts},
             "registers": {block: {key: value for key, value in source.registers(block).items()
                                   if value["offset"] in offsets}
                           for block, offsets in wanted.items()},
@@ -205,9 +213,13 @@ def collect(folder: Path, header: Header, pins: set[str]) -> dict[str, Any]:
 def _text(facts: dict[str, Any]) -> str:
     """One register or pin a line, so that a difference shows."""
     text = json.dumps(facts, indent=1)
-    text = re.sub(r"\[\s+((?:[^\[\]{}]|\[[^\[\]]*\])*?)\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)
-    text = re.sub(r"\[\s+((?:[^\[\]{}]|\[[^\[\]]*\])*?)\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)
-    return re.sub(r"\{\s*(\"offset\"[^{}]*?)\s*\}", lambda m: "{" + re.sub(r"\s*\n\s*", " ", m[1]) + "}", text) + "\n"
+    for _ in range(2):  # lists, then lists of lists
+        text = re.sub(r"\[\s+((?:[^\[\]{}]|\[[^\[\]]*\])*?)\s+\]", lambda found: f"[{_one_line(found[1])}]", text)
+    return re.sub(r"\{\s*(\"offset\"[^{}]*?)\s*\}", lambda found: f"{{{_one_line(found[1])}}}", text) + "\n"
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"\s*\n\s*", " ", text)
 
 
 def main(arguments: list[str] | None = None) -> int:

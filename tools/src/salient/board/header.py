@@ -22,8 +22,8 @@ _FIELD = re.compile(r"#define (\w+) (?:BIT\((\d+)\)|BITS\((\d+), (\d+)\))$")
 
 @dataclass(frozen=True)
 class Register:
-    """block: prefix of its name. base: name of its block's address, or None where the address is an argument. access: r,
-    w or rw. reset: None where it depends on the instance or the kind of reset. one_clears, zero_clears: bits."""
+    """block: prefix of its name. base: name of its block's address, or None where the address is an argument. access:
+    r, w or rw. reset: None where it depends on the instance or the kind of reset. one_clears, zero_clears: bits."""
 
     name: str
     block: str

@@ -24,6 +24,28 @@ PAGE = ROOT / "docs" / "board" / "pins.md"
 PICTURE = ROOT / "docs" / "images" / "board.svg"
 MODES = {"input": 0, "alternate": 2, "analogue": 3}
 PULLS = {"none": 0, "up": 1, "down": 2}
+_HEAD = """# Pins of the NUCLEO-G474RE
+
+Generated from `hal/stm32g4/pins.toml` by `tools/salient docs --generate`; do not edit.
+
+For those who wire a power stage to the board. A test compares the table with the alternate functions of the chip.
+
+![Pins of the board, by group](../images/board.svg)
+
+| signal | pin | header | function | pull | |
+| --- | --- | --- | --- | --- | --- |"""
+_RULES = """
+## Rules of the stage
+
+- Gate drivers: on when high. A pull-down resistor at each input keeps them off while the processor is in reset.
+- Current sensors: 0 V at 0 A, 3.3 V at `adc_current_A` of the machine file. DC link: 3.3 V at `adc_voltage_V`.
+- Temperature sensors: linear, 0 V at -100 degrees Celsius, 3.3 V at 300 degrees Celsius, pulled up when open.
+- `BREAK_1` and `BREAK_2`: both on the output of one AND gate of `STO_1`, `STO_2` and `DRIVER_FAULT`. An open wire is
+  low, and opens the switches.
+- The STO lines also cut the supply of the gate drivers: the safety function does not rest on the processor.
+- PC13 to PC15, PF0, PF1, PA13 and PA14 are the button, the crystals and the debugger of the board.
+- The pins of the headers are from ST's user manual UM2505: compare them with the revision of your board.
+"""
 _KEYS = {"signal", "pin", "functions", "mode", "pull", "connector", "group", "text"}
 
 
@@ -96,24 +118,11 @@ def header(pins: list[Pin]) -> str:
 
 def page(pins: list[Pin]) -> str:
     """Text of the document."""
-    lines = ["# Pins of the NUCLEO-G474RE", "", "<!-- Generated from hal/stm32g4/pins.toml by tools/salient docs --generate -->",
-             "", "For those who wire a power stage to the board. `hal/stm32g4/pins.toml` is the only place where pins are written;",
-             "a test compares it with the alternate functions of the chip.", "",
-             "![Pins of the board, by group](../images/board.svg)", "",
-             "| signal | pin | header | function | pull | |", "| --- | --- | --- | --- | --- | --- |"]
+    lines = [_HEAD]
     for pin in pins:
         function = ", ".join(name.partition(":")[0] for name in pin.functions) or "input"
         lines.append(f"| `{pin.signal}` | {pin.pin} | {pin.connector} | {function} | {pin.pull} | {pin.text} |")
-    lines += ["", "## Rules of the stage", "",
-              "- Gate drivers: on when high. A pull-down resistor at each input keeps them off while the processor is in reset.",
-              "- Current sensors: 0 V at 0 A, 3.3 V at `adc_current_A` of the machine file. DC link: 3.3 V at `adc_voltage_V`.",
-              "- Temperature sensors: linear, 0 V at -100 degrees Celsius, 3.3 V at 300 degrees Celsius, pulled up when open.",
-              "- `BREAK_1` and `BREAK_2`: both on the output of one AND gate of `STO_1`, `STO_2` and `DRIVER_FAULT`. An open",
-              "  wire is low, and opens the switches.",
-              "- The STO lines also cut the supply of the gate drivers: what the processor does is not the safety function.",
-              "- PC13 to PC15, PF0, PF1, PA13 and PA14 are the button, the crystals and the debugger of the board.",
-              "- The header columns are those of ST's user manual UM2505: compare them with your board's revision.", ""]
-    return "\n".join(lines)
+    return "\n".join([*lines, _RULES])
 
 
 _WIDTH, _ROW, _TOP, _COLUMN = 1180, 24, 78, 392
@@ -130,8 +139,8 @@ def picture(pins: list[Pin]) -> str:
     height = _TOP + max(sum(len(groups[name]) + 2 for name in column) for column in columns) * _ROW
     out = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" font-family="sans-serif" '
            'font-size="13">', f'<rect width="{_WIDTH}" height="{height}" fill="#ffffff"/>',
-           f'<text x="{_WIDTH // 2}" y="38" text-anchor="middle" font-size="20" fill="#1a1a1a">NUCLEO-G474RE: pins of the '
-           'asymmetric half-bridge stage</text>']
+           f'<text x="{_WIDTH // 2}" y="38" text-anchor="middle" font-size="20" fill="#1a1a1a">NUCLEO-G474RE: pins of '
+           'the asymmetric half-bridge stage</text>']
     for number, column in enumerate(columns):
         left, top = 16 + number * _COLUMN, _TOP
         for name in column:

@@ -546,3 +546,10 @@ def _load_profile_of(path: Path, name: str) -> str:
 def _check_controllers(controllers: list[str]) -> None:
     if not controllers or len(set(controllers)) != len(controllers):
         raise TextFileError(f"controllers: must be a list of different values, each {either(CONTROLLERS)}")
+
+
+def with_setting(scenario: Scenario, name: str, value: float) -> Scenario:
+    """The scenario with a parameter or a variable of the bench set."""
+    if name in bench_variables():
+        return replace(scenario, bench={**scenario.bench, name: value})
+    return replace(scenario, parameters={**scenario.parameters, name: value})

@@ -25,14 +25,21 @@ from salient.bench.load_profile import load_profile_path, read_load_profile
 from salient.bench.programs import EmulatorError, executable
 from salient.bench.rig import variable_range
 from salient.bench.session import SessionError
+from salient.bench.settings import parse_values
 from salient.errors import UsageError
 from salient.experiments import metrics as run_metrics
 from salient.experiments import tasks
 from salient.experiments.metrics import MetricsError, load_step_metrics, losses, start_metrics
 from salient.experiments.results import rounded
 from salient.experiments.scaled import scale_of_name, scaled
-from salient.experiments.scenario import RunResult, Scenario, check_parameters, load_scenarios, run_scenario
-from salient.experiments.settings import parse_values, with_setting
+from salient.experiments.scenario import (
+    RunResult,
+    Scenario,
+    check_parameters,
+    load_scenarios,
+    run_scenario,
+    with_setting,
+)
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from salient.bench.session import SILENCE_MAX_S, Session
+from salient.bench.settings import parse_values
 from salient.errors import UsageError
-from salient.experiments.settings import parse_values
 from salient.identify.link import linked
 from salient.identify.report import write_report
 from salient.identify.result import Result, result_of, write_machine

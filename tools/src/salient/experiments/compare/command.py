@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
 
+from salient.bench.settings import parse_values
 from salient.config import DEFAULTS
 from salient.errors import UsageError, close_names
 from salient.experiments.compare import baseline, mismatch, results_file, summary_file, table
@@ -18,8 +19,7 @@ from salient.experiments.compare.cases import GROUPS, TITLES, scenario_toml
 from salient.experiments.compare.machine import Subject, cases_of, subject, targets_of
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
-from salient.experiments.scenario import check_parameters
-from salient.experiments.settings import parse_values, with_setting
+from salient.experiments.scenario import check_parameters, with_setting
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 from salient.paths import COMMAND, make_folder

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from salient.bench.rig import bench_variables, variable_range
 from salient.errors import UsageError, close_names
-from salient.experiments.scenario import Scenario
 from salient.machine.parameter_table import read_table
 
 COUNT_MAX = 10_000
@@ -50,10 +48,3 @@ def check_name(name: str, text: str) -> None:
     if name not in parameters and name not in bench_variables():
         raise UsageError(f"--set {text}: {name}: neither a parameter of the drive nor a variable of the test "
                          f"bench; {close_names(name, [*parameters, *bench_variables()])}")
-
-
-def with_setting(scenario: Scenario, name: str, value: float) -> Scenario:
-    """The scenario with a parameter or a variable of the bench set."""
-    if name in bench_variables():
-        return replace(scenario, bench={**scenario.bench, name: value})
-    return replace(scenario, parameters={**scenario.parameters, name: value})
