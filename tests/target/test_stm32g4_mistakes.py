@@ -7,7 +7,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
 from salient.bench.programs import command_line
 from salient.config import BOARD_BUILD, BenchConfig
 
