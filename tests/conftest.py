@@ -24,7 +24,7 @@ BUILDS = {
     "hil": {"host": ["salient_host"]},
     "plant": {"host": []},
     "tools": {"host": [], WASM_BUILD: []},
-    "target": {preset: [] for preset in ("host", *TARGET_BUILDS, WASM_BUILD)},
+    "target": {preset: [] for preset in ("host", *TARGET_BUILDS, "stm32g4", WASM_BUILD)},
 }
 """Folder of tests: the presets that it runs, each with its targets, none for all."""
 

@@ -81,6 +81,7 @@ TARGET_DEPENDENCIES = {
         Dependency("qemu-system-misc", "emulated RV32", _tool("qemu-system-riscv32")),
     ),
 }
+TARGET_DEPENDENCIES["stm32g4"] = TARGET_DEPENDENCIES["cortex-m4"][:2]
 WASM_DEPENDENCIES = (
     Dependency("clang-19", "compiler for WebAssembly", _tool("clang-19")),
     Dependency("lld-19", "its linker", _tool("wasm-ld-19")),
@@ -102,8 +103,8 @@ MEASUREMENT_DEPENDENCIES = (
     Dependency("valgrind", "instruction counts", _tool("valgrind")),
 )
 
-WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs", "evidence")
-"""Commands that need no drive."""
+WITHOUT_BUILD = ("log", "monitor", "command", "view", "scope", "machine", "docs", "evidence", "board")
+"""Commands that need no drive of the host; `board build` builds by itself."""
 
 
 def _vm_packages() -> list[str]:
@@ -251,6 +252,8 @@ def _needs_wasm(options: argparse.Namespace) -> bool:
 
 def dependencies(options: argparse.Namespace, target: str) -> tuple[Dependency, ...]:
     """Debian packages that a command needs."""
+    if options.command == "board" and options.action == "build":
+        return BUILD_DEPENDENCIES + TARGET_DEPENDENCIES["cortex-m4"][:2]
     if not needs_build(options):
         return tuple(dependency for dependency in BUILD_DEPENDENCIES if dependency.package == "python3-venv")
     found = BUILD_DEPENDENCIES + TARGET_DEPENDENCIES[target]
@@ -275,7 +278,8 @@ def host_targets(command: str, target: str) -> list[str]:
     targets += ["plant_benchmarks"] if command == "benchmark" else []
     targets += ["salient_campaign"] if command in ("campaign", "replay") else []
     targets += ["salient_reference"] if command == "compare" else []
-    targets += ["salient_target"] if target != "host" else []
+    if target != "host":
+        targets += ["salient_stm32g4" if target == "stm32g4" else "salient_target"]
     return targets
 
 

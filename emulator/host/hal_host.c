@@ -98,7 +98,7 @@ uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
     if (hal->board->context != BOARD_DEFERRED) {
         require(hal, true, __func__);
     }
-    return (uint32_t)(hal->board->interrupt_took_ns / PWM_TIMER_TICK_NS);
+    return (uint32_t)pwm_timer_ticks(hal->board->interrupt_took_ns);
 }
 
 void hal_interrupt_request_deferred(hal_t *hal) {

@@ -52,12 +52,12 @@ void half_bridge_pattern(half_bridge_pattern_t *pattern, uint16_t upper, uint16_
     pattern->count = (uint8_t)(2 * count);
     for (unsigned edge = 0; edge < count; edge++) {
         switches ^= toggles[edge];
-        pattern->delay_ns[edge] = ticks[edge] * PWM_TIMER_TICK_NS;
+        pattern->delay_ns[edge] = (uint32_t)pwm_timer_ns(ticks[edge]);
         pattern->switches[edge] = switches;
     }
     for (unsigned edge = count; edge-- > 0;) {
         switches ^= toggles[edge];
-        pattern->delay_ns[2 * count - 1 - edge] = (2 * period - ticks[edge]) * PWM_TIMER_TICK_NS;
+        pattern->delay_ns[2 * count - 1 - edge] = (uint32_t)pwm_timer_ns(2 * period - ticks[edge]);
         pattern->switches[2 * count - 1 - edge] = switches;
     }
 }

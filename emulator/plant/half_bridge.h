@@ -33,10 +33,10 @@ typedef struct {
 } half_bridge_pattern_t;
 
 /* Computes one phase's pattern of a period of 2 * period_ticks timer ticks from its compare values, with edges exact to
- * the nanosecond; hal_pwm.h defines how the switches follow them. Pulses and gaps of a switch within the period that
- * are shorter than 2 * shortest_ticks are suppressed. The lower switch's pulse and the upper switch's gap lie around
- * the ends of the period; only their part within this period counts, so that the pattern depends on no later period.
- * period_ticks > 0. */
+ * the nanosecond (pwm_timer.h); hal_pwm.h defines how the switches follow them. Pulses and gaps of a switch within the
+ * period that are shorter than 2 * shortest_ticks are suppressed. The lower switch's pulse and the upper switch's gap
+ * lie around the ends of the period; only their part within this period counts, so that the pattern depends on no later
+ * period. period_ticks > 0. */
 void half_bridge_pattern(half_bridge_pattern_t *pattern, uint16_t upper, uint16_t lower, uint16_t period_ticks,
                          uint32_t shortest_ticks);
 

@@ -48,7 +48,7 @@ static void begin(plant_t *plant, const benchmark_t *benchmark) {
 
 /* Runs one pass; records samples unless NULL. */
 static void run(plant_t *plant, const benchmark_t *benchmark, const hal_pwm_compare_t *compares, sample_t *samples) {
-    const uint64_t period_ns = UINT64_C(2) * benchmark->period_ticks * PWM_TIMER_TICK_NS;
+    const uint64_t period_ns = pwm_timer_ns(UINT64_C(2) * benchmark->period_ticks);
     for (uint32_t period = 0; period < benchmark->periods; period++) {
         plant_set_switches(plant, &compares[period], (uint16_t)benchmark->period_ticks);
         plant_advance(plant, (period + 1) * period_ns);

@@ -172,7 +172,7 @@ static void resume_rig(void) {
 /* Runs to the trigger that the drive serves; those before it are missed. */
 static void run_to_trigger(void) {
     rig_t *rig = &simulation.rigs[0];
-    const uint64_t period_ns = UINT64_C(2) * PWM_TIMER_TICK_NS * rig->board.period_ticks;
+    const uint64_t period_ns = pwm_timer_ns(UINT64_C(2) * rig->board.period_ticks);
     /* The trigger number wraps after 71 minutes at 1 MHz. */
     const uint32_t ahead = mailbox->trigger - (uint32_t)(rig->board.time_ns / period_ns);
     const uint64_t trigger_ns = (rig->board.time_ns / period_ns + ahead) * period_ns;
@@ -233,7 +233,7 @@ static bool serve_time(mailbox_command_t command) {
         return true;
     case MAILBOX_INTERRUPT_END:
         /* The drive's counter rounds down: an interrupt that ends at a trigger has missed it. */
-        simulation.rigs[0].board.interrupt_took_ns = (uint64_t)mailbox->elapsed_ticks * PWM_TIMER_TICK_NS + 1;
+        simulation.rigs[0].board.interrupt_took_ns = pwm_timer_ns(mailbox->elapsed_ticks) + 1;
         resume_rig();
         return true;
     default:

@@ -13,7 +13,7 @@ void control_period_schedule_hold(control_period_t *period) {
 }
 
 void control_period_set_length(control_period_t *period) {
-    period->length_ns = UINT64_C(2) * period->board->period_ticks * PWM_TIMER_TICK_NS;
+    period->length_ns = pwm_timer_ns(UINT64_C(2) * period->board->period_ticks);
 }
 
 void control_period_begin(control_period_t *period) {

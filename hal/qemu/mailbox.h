@@ -22,12 +22,15 @@
 #include "hal_pwm.h"
 
 /* Changes with the structure, so that an image and a host with different layouts stop at the start. An image has arrays
- * for the phases that it is compiled for (hal.h), the host for the most. */
-#define MAILBOX_LAYOUT_OF(phases) (7u << 8 | (phases))
+ * for the phases that it is compiled for (hal.h), the host for the most. With the clock, which both compile in. */
+#define MAILBOX_LAYOUT_OF(phases) (7u << 8 | (phases) | (uint32_t)(MAILBOX_PWM_CLOCK_HZ / 1000000 - 200) << 16)
 #define MAILBOX_LAYOUT MAILBOX_LAYOUT_OF(HAL_PHASES_MAX)
 
-/* Clock of the emulated PWM timer. */
-#define MAILBOX_PWM_CLOCK_HZ 200000000
+/* Clock of the emulated PWM timer: 200 MHz, or what the build of both sides sets. */
+#ifndef SALIENT_PWM_CLOCK_MHZ
+#define SALIENT_PWM_CLOCK_MHZ 200
+#endif
+#define MAILBOX_PWM_CLOCK_HZ (SALIENT_PWM_CLOCK_MHZ * 1000000)
 
 /* Exit codes of a drive that ends QEMU itself (sysexits.h). */
 #define MAILBOX_EXIT_FAULT 70  /* an unexpected CPU exception */

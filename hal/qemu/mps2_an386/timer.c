@@ -17,6 +17,7 @@ typedef struct {
 #define CONTROL_ENABLE 1u
 #define CONTROL_INTERRUPT 8u
 #define TICKS_PER_COUNT (MAILBOX_PWM_CLOCK_HZ / COUNTER_CLOCK_HZ)
+_Static_assert(TICKS_PER_COUNT *COUNTER_CLOCK_HZ == MAILBOX_PWM_CLOCK_HZ, "the clock is a multiple of the counter's");
 
 static uint32_t period;        /* counts */
 static uint32_t trigger_value; /* of the counter, at the trigger served last */

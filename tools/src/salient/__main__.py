@@ -214,6 +214,12 @@ def _pil(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _board(options: argparse.Namespace) -> int:
+    from salient.board.command import run
+
+    return run(options)
+
+
 def _campaign(options: argparse.Namespace) -> int:
     from salient.experiments.campaign.command import run_campaign
 
@@ -234,6 +240,7 @@ _COMMANDS = {
     "log": _log,
     "monitor": _monitor,
     "command": _command,
+    "board": _board,
     "campaign": _campaign,
     "replay": _replay,
     "view": _view,

@@ -31,8 +31,10 @@ from salient.version import VERSION
 
 TEST_STEPS = ("style", "unit", "sanitize", "target", "hil", "plant", "tools", "socketcan")
 """The steps of `test`, in order."""
-CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay", "docs", "evidence")
+CLONE_ONLY = ("test", "benchmark", "pil", "wheel", "tab", "campaign", "replay", "docs", "evidence", "board")
 """Commands that need the sources."""
+BOARD_CLOCKS = ("170", "100")
+BOARD_ENCODERS = ("absolute", "index")
 _SHOWN_OUT, _SHOWN_BUILD = (text.replace("%", "%%") for text in (str(OUT), from_root(BUILD)))
 """For argparse, which formats a text of help."""
 CHANGE_PERCENT = 10.0
@@ -223,6 +225,25 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                       "name of a variant its longest path by function")
     task.add_argument("--figures", action="store_true",
                      help="instead: repeat the measurements of the committed baseline and write it")
+
+    board = command("board", "an image for the board NUCLEO-G474RE, never run on hardware")
+    actions = board.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)
+    text = "build the image for a machine: ELF, BIN and HEX, and a line with the flash and RAM that it takes"
+    action = actions.add_parser("build", help=text, description=text, prog=f"{COMMAND} board build")
+    for name in ("machine", "controller", "node", "bit_rate"):
+        action.add_argument(flag_of(name), dest=name, type=_option_type(name), default=DEFAULTS[name],
+                            metavar=OPTIONS[name].metavar, help=description(name))
+    action.add_argument("--clock", type=_one_of(BOARD_CLOCKS), default=BOARD_CLOCKS[0], metavar="MHZ",
+                        help=f"clock of processor and timers: {either(BOARD_CLOCKS)}, the second for comparison with "
+                        f"the emulator (default {BOARD_CLOCKS[0]})")
+    action.add_argument("--encoder", type=_one_of(BOARD_ENCODERS), default=BOARD_ENCODERS[0], metavar="KIND",
+                        help=f"{either(BOARD_ENCODERS)}: it counts to its absolute position at power-up, or is "
+                        "absolute after its index has passed, before which no switch closes (default "
+                        f"{BOARD_ENCODERS[0]})")
+    action.add_argument("--out", type=Path, default=OUT / "board", metavar="DIR", help="folder (default %(default)s)")
+    text = "write an image into the flash of a board, by OpenOCD or st-flash"
+    action = actions.add_parser("flash", help=text, description=text, prog=f"{COMMAND} board flash")
+    action.add_argument("file", type=Path, metavar="FILE", help="of board build: .elf, .hex or .bin")
 
     campaign = command("campaign", "random worlds by seed, judged by the plant: faults, hostile clients, machines; "
                        "exit code 1 when a property is violated")

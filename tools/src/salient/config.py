@@ -29,6 +29,8 @@ WASM_BUILD = "wasm"
 """Firmware and emulator in WebAssembly, run by Node (salient.bench.wasm)."""
 TARGETS = ("host", "cortex-m4", "rv32")
 """Builds that a command offers: the process of the emulator, or QEMU."""
+BOARD_BUILD = "stm32g4"
+"""Image for the NUCLEO-G474RE in the register-level model of its part (emulator/stm32g4)."""
 PACES = ("lockstep", "realtime", "free")
 PACE_FACTOR_MIN, PACE_FACTOR_MAX = 0.01, 1000.0
 """PACING_FACTOR_MIN and PACING_FACTOR_MAX of emulator/rig/pacing.h."""
@@ -229,9 +231,10 @@ class BenchConfig(Conditions):
     stop_at_s: float | None = _option(None, NUMBER, "virtual time at which it ends; not with --pace lockstep",
                                       metavar="X", minimum=1e-6, maximum=281_474.0)
     follow_stdin: bool = _option(False, FLAG, "ends when standard input does")
-    build: str = _option("host", WORD, "processor that runs the firmware: the host, or one that QEMU emulates",
-                         metavar="NAME", choices=TARGETS, commands=("sim", "demo", "run"), flag="target",
-                         argument=False)
+    build: str = _option("host", WORD, "processor that runs the firmware: the host, one that QEMU emulates, "
+                         "or a board's part in a register-level model",
+                         metavar="NAME", choices=(*TARGETS, BOARD_BUILD), commands=("sim", "demo", "run"),
+                         flag="target", argument=False)
     program: Path | None = _option(None, FILE, "executable of another project instead of the build's",
                                    argument=False)
     instructions: Path | None = _option(None, FILE, "instruction counts", argument=False)

@@ -15,12 +15,14 @@ CONFIGURATION = ROOT / "mkdocs.yml"
 def write_reference() -> None:
     """Writes the reference pages that need no measurement. A measured page names its command."""
     from salient.bench import faults
+    from salient.board import pins
     from salient.experiments.campaign import report
     from salient.generate import checkers, commands, objects, parameters, resolution, signals
 
     for page in (faults, checkers, commands, objects, parameters, resolution, signals):
         page.main()
     report.write_pages()
+    pins.write_documents()
 
 
 def run(out: Path, *, generate: bool = False) -> int:

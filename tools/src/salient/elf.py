@@ -4,6 +4,7 @@ binutils of its processor."""
 from __future__ import annotations
 
 import re
+import shutil
 import struct
 import subprocess
 from dataclasses import dataclass
@@ -62,11 +63,18 @@ class ElfImage:
 
     def run(self, tool: str, *arguments: str, given: str | None = None) -> str:
         """Output of one of the binutils, called with the arguments followed by the image."""
-        try:
-            return subprocess.run([self._prefix + tool, *arguments, str(self.path)], input=given, text=True, check=True,
-                                  stdout=subprocess.PIPE).stdout
-        except FileNotFoundError:
-            raise UsageError(f"{self._prefix}{tool} is missing: install the Debian package {self._package}") from None
+        return subprocess.run([self._tool(tool), *arguments, str(self.path)], input=given, text=True, check=True,
+                              stdout=subprocess.PIPE).stdout
+
+    def _tool(self, tool: str) -> str:
+        name = self._prefix + tool
+        if shutil.which(name) is None:
+            raise UsageError(f"{name} is missing: install the Debian package {self._package}")
+        return name
+
+    def copy_to(self, path: Path, kind: str) -> None:
+        """Writes the loaded content in a format of objcopy, as binary or ihex."""
+        subprocess.run([self._tool("objcopy"), "-O", kind, str(self.path), str(path)], check=True)
 
     def symbols(self) -> dict[str, int]:
         """Addresses of the symbols by name."""

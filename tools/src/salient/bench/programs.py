@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from salient.builder import build_preset, run_commands
-from salient.config import TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
+from salient.config import BOARD_BUILD, TARGET_BUILDS, TARGETS, WASM_BUILD, BenchConfig
 from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
 from salient.machine.cache import content_key, machine_image
@@ -28,6 +28,9 @@ _BUILDERS = {"host": "any tools/salient command",
              **{build: f"any tools/salient command with --target {build}" for build in TARGETS[1:]}}
 _IMAGE_PARTS = ("drive_codec", "salient_firmware", "salient_port", "salient_main")
 """Targets of CMake that images of every machine have in common."""
+BOARD_CLOCK_MHZ = 100
+"""Of the images that the model runs: its ticks are whole nanoseconds, as the plant's."""
+BOARD_ADC_BITS = 12
 
 
 class EmulatorError(RunFailed):
@@ -41,6 +44,8 @@ def executable(build: str = "host") -> Path:
         raise UsageError(f"--target {build}: only in a clone of the repository, where it is built; must be host")
     if build in TARGET_BUILDS:
         return _built("host", "salient_target", _builder(build))
+    if build == BOARD_BUILD:
+        return _built("host", "salient_stm32g4", _builder("host"))
     if build == WASM_BUILD:
         return _built(build, "salient.wasm", _builder(build))
     return _built(build, "salient_host", _builder(build))
@@ -74,6 +79,8 @@ def command_line(config: BenchConfig) -> list[str]:
     arguments = replace(config, machine_image=config.machine_image or machine_image(config.machine, config.true_machine)
                         ).arguments()
     start = str(config.program or executable(config.build))
+    if config.build == BOARD_BUILD:
+        return [start, *_board_arguments(config), *arguments]
     if config.build not in TARGET_BUILDS:
         if config.instruction_ns is not None:
             raise UsageError(f"--instruction-ns {config.instruction_ns}: only with --target cortex-m4")
@@ -93,6 +100,28 @@ def command_line(config: BenchConfig) -> list[str]:
     if config.instruction_ns is not None:
         line += ["--instruction-ns", str(config.instruction_ns)]
     return [*line, *arguments]
+
+
+def _board_arguments(config: BenchConfig) -> list[str]:
+    """Image and wiring for the model of the board's part. Telemetry has the parameter's period: an image has no option
+    for it. UsageError: an option that the image cannot have."""
+    from salient.board.command import build_image  # cantools and NumPy, and here only
+    from salient.board.pins import read_pins
+
+    refused = {"--drives": config.drives > 1, "--instruction-ns": config.instruction_ns is not None,
+               "--instructions": config.instructions is not None, "--execution": config.execution is not None,
+               "--protocol": config.protocol != "salient", "--adc-bits": config.adc_bits != BOARD_ADC_BITS,
+               "--encoder-edges": config.encoder_edges}
+    for option, given in refused.items():
+        if given:
+            raise UsageError(f"{option}: not with --target {BOARD_BUILD}")
+    elf = build_image(config.machine, clock_mhz=BOARD_CLOCK_MHZ, controller=config.controller, node=config.node,
+                      bit_rate=config.bit_rate)
+    wiring = BUILD / "stm32g4.wiring"
+    text = "".join(f"{pin.signal} {pin.pin}\n" for pin in read_pins())
+    if not wiring.exists() or wiring.read_text(encoding="utf-8") != text:
+        wiring.write_text(text, encoding="utf-8")
+    return [str(elf), "--wiring", str(wiring)]
 
 
 def _builder(build: str) -> str:

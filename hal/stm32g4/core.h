@@ -1,0 +1,18 @@
+/* Registers of the processor's core (Armv7-M architecture reference manual, B3.2 and B3.4). */
+#ifndef STM32G4_CORE_H
+#define STM32G4_CORE_H
+
+#include <stdint.h>
+
+#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04)
+#define SCB_ICSR_PENDSVSET (UINT32_C(1) << 28)
+#define SCB_VTOR (*(volatile uint32_t *)0xE000ED08)
+#define SCB_AIRCR (*(volatile uint32_t *)0xE000ED0C)
+#define SCB_AIRCR_SYSRESETREQ UINT32_C(0x05FA0004) /* with the key of the register */
+#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22)
+#define NVIC_ISER(irq) (*(volatile uint32_t *)(0xE000E100u + 4u * ((irq) / 32u)))
+#define NVIC_ICPR(irq) (*(volatile uint32_t *)(0xE000E280u + 4u * ((irq) / 32u)))
+#define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400u + (irq)))
+#define NVIC_MASK(irq) (UINT32_C(1) << ((irq) % 32u))
+
+#endif

@@ -1,0 +1,116 @@
+/* Vectors, start and main program. */
+#include <string.h>
+
+#include "drive/drive.h"
+#include "hal_memory.h"
+#include "stm32g4/board.h"
+#include "stm32g4/core.h"
+#include "stm32g4/registers.h"
+
+/* Symbols of the linker script. */
+extern const uint32_t code_start[];
+extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], stack_end[], stack_top[];
+
+hal_t board;
+static drive_t drive;
+
+/* After the code; salient.generate.code_check fills in both. */
+__attribute__((section(".code_check"), used)) const volatile uint32_t code_check[2] = {0, 0};
+
+void hal_memory(const hal_t *hal, hal_memory_t *memory) {
+    (void)hal;
+    *memory = (hal_memory_t){
+        .code = code_start,
+        .code_words = code_check[0],
+        .code_crc = code_check[1],
+        .stack = stack_end,
+        .stack_words = (uint32_t)(stack_top - stack_end),
+    };
+}
+
+static void control_handler(void) {
+    if (control_begin(&board)) {
+        drive_control_interrupt(&drive, &board);
+    }
+    control_end(&board);
+}
+
+static void deferred_handler(void) {
+    drive_deferred_interrupt(&drive, &board);
+}
+
+static void can_handler(void) {
+    can_interrupt(&board);
+}
+
+/* Double error of the flash, or the crystal has stopped, which has broken both timers already. */
+static void nmi_handler(void) {
+    if ((RCC_CIFR & RCC_CIFR_CSSF) || !nvm_error_in_parameters()) {
+        board_halt();
+    }
+}
+
+static void fault_handler(void) {
+    board_halt();
+}
+
+static noreturn void run(void) {
+    SCB_VTOR = (uint32_t)(uintptr_t)code_start;
+    board.watchdog_reset = (RCC_CSR & RCC_CSR_IWDGRSTF) != 0;
+    RCC_CSR |= RCC_CSR_RMVF;
+    clock_init();
+    pins_init();
+    encoder_init();
+    time_init();
+    pwm_init();
+    break_init();
+    adc_init(&board);
+    can_init();
+    random_init();
+    const drive_config_t config = {
+        .control_rate_hz = board_control_rate_hz,
+        .controller = (drive_controller_t)BOARD_CONTROLLER,
+        .node = BOARD_NODE,
+        .telemetry_period_ms = BOARD_TELEMETRY_PERIOD_MS,
+    };
+    const bool started = drive_init(&drive, &board, &config);
+    board_interrupts_enable(&board);
+    for (;;) {
+        if (started) {
+            drive_background(&drive, &board);
+        }
+        __asm__ volatile("wfi" ::: "memory"); /* the next period's interrupt is the longest wait */
+    }
+}
+
+/* Far enough below the present frame for the frames of the calls here. */
+__attribute__((noipa)) static void stack_paint(void) {
+    volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
+    for (volatile uint32_t *word = stack_end; word < end; word++) {
+        *word = HAL_STACK_UNUSED;
+    }
+}
+
+__attribute__((used)) noreturn void program_start(void) {
+    __asm__ volatile("cpsid i" ::: "memory");
+    stack_paint();
+    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    run();
+}
+
+typedef void (*vector_t)(void);
+#define INTERRUPTS 102
+
+__attribute__((section(".first"), used)) static const struct {
+    uint32_t *stack;
+    vector_t exceptions[15];
+    vector_t interrupts[INTERRUPTS];
+} vectors = {
+    .stack = stack_top,
+    .exceptions = {program_start, nmi_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, fault_handler, fault_handler, fault_handler, fault_handler, fault_handler,
+                   fault_handler, deferred_handler, fault_handler},
+    /* No other one is enabled; the address 0 of one that comes all the same is a fault. */
+    .interrupts = {[FDCAN1_IT0_IRQ] = can_handler, [ADC5_IRQ] = control_handler},
+};
