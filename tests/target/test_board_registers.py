@@ -60,6 +60,11 @@ def test_a_wrong_interrupt_is_found(name):
 def test_wrong_facts_of_a_register_are_found(register: Register):
     access = "r" if register.access != "r" else "rw"
     wrong = [replace(register, access=access), replace(register, offset=register.offset + 0x800)]
+    known = FACTS_OF_THE_CRATES["svd"]["registers"][register.block].values()
+    if all(value["offset"] != register.offset for value in known):  # the other crate has no values and no bits to clear
+        assert register.name in {"GPIO_IDR", "GPIO_AFRL", "GPIO_AFRH"}
+        assert all(found(with_register(changed, register.name)) for changed in wrong)
+        return
     if register.reset is not None and f"{register.name}.reset" not in DECIDED:
         wrong.append(replace(register, reset=register.reset ^ 0x10))
     if f"{register.name}.one_clears" not in DECIDED:
