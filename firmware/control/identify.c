@@ -11,6 +11,8 @@
 #define RECORD_SHIFT 5
 #define PULSE_SPACING 16u
 #define MARK_PERIODS 32u
+/* Records of a hold in a millisecond: as many as leave the bus half of its time. */
+#define HOLD_RECORDS 2u
 /* A hold: the error of the current is removed in so many periods, at most at a quarter of full voltage. */
 #define HOLD_SHIFT 2
 #define HOLD_DUTY_MAX_Q15 (MODULATOR_DUTY_ONE_Q15 / 4)
@@ -40,16 +42,16 @@ COLD void identify_begin(identify_t *identify, uint32_t angle, bool permitted) {
     }
 }
 
-/* Sums of squares: (A Q7.9 >> 8)^2 is A^2 Q2, at most 2^16; with 2^32 the limit of 2^16 * 25000 periods is not
- * exceeded before it ends the run. */
+/* Sums of squares: (A Q7.9 >> 8)^2 / 2 is A^2 Q1, at most 2^15; 2^15 in each of the 100 periods of 1000 ms is below
+ * 2^32, and the limit ends the run before a sum exceeds it. */
 static void check_limits(const identify_parameters_t *parameters, identify_t *identify,
                          const identify_sample_t *sample) {
     const int32_t most_q9 = parameters->limit_q9 + (parameters->limit_q9 >> 5);
     const uint32_t limit_q1 = (uint32_t)parameters->limit_q9 >> 8;
-    const uint32_t most_energy = limit_q1 * limit_q1 * parameters->periods_per_ms * IDENTIFY_ENERGY_MS;
+    const uint32_t most_energy = limit_q1 * limit_q1 / 2u * parameters->periods_per_ms * IDENTIFY_ENERGY_MS;
     for (unsigned phase = 0; phase < parameters->phases && phase < HAL_PHASES_MAX; phase++) {
         const uint32_t current_q1 = ((uint32_t)sample->current_q9[phase] + 128u) >> 8;
-        identify->energy[phase] += current_q1 * current_q1;
+        identify->energy[phase] += current_q1 * current_q1 / 2u;
         if (identify->energy[phase] > most_energy) {
             end(identify, IDENTIFY_ENERGY);
         }
@@ -205,7 +207,9 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
  * which the voltage or its integral would be another one. */
 static bool is_due(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
     const bool pulses = identify->state >= IDENTIFY_CHARGES && identify->state <= IDENTIFY_RESTS;
-    const uint32_t spacing = pulses ? PULSE_SPACING : parameters->periods_per_ms;
+    const uint32_t spacing = pulses                                ? PULSE_SPACING
+                             : identify->state == IDENTIFY_HOLDS ? parameters->periods_per_ms / HOLD_RECORDS
+                                                                   : parameters->periods_per_ms;
     const bool changed = identify->state != identify->recorded_state || identify->action != identify->recorded_action ||
                          fixed_abs(current_q9 - identify->recorded_q9) > parameters->limit_q9 >> RECORD_SHIFT;
     identify->recorded_periods++;

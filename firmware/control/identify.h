@@ -87,7 +87,7 @@ typedef struct {
     int32_t rise_q9;                       /* of it in the last period at full voltage of this pulse; 0: none yet */
     int32_t growth_q9;                     /* of the rise, at least 0 */
     int32_t first_rise_q9[HAL_PHASES_MAX]; /* largest one of a pulse's first period; 0: not known */
-    uint32_t energy[HAL_PHASES_MAX];       /* sum of squares of currents, 2^-2 A^2 periods */
+    uint32_t energy[HAL_PHASES_MAX];       /* sum of squares of currents, 2^-1 A^2 periods */
 } identify_t;
 
 /* Record: word 0 is the current of the phase, A, Q7.9, and from bit 16 on the DC-link voltage, V, Q9.6. Word 1: */
@@ -97,8 +97,8 @@ typedef struct {
 #define IDENTIFY_RECORD_PHASE_BITS 3u
 #define IDENTIFY_RECORD_ANGLE_BITS 20u /* the highest ones of the encoder's angle */
 
-/* Longest time in which a winding carries the limit, or less current for as much copper loss: 1/2 s. */
-#define IDENTIFY_ENERGY_MS 500u
+/* Longest time in which a winding carries the limit, or less current for as much copper loss: 1 s. */
+#define IDENTIFY_ENERGY_MS 1000u
 #define IDENTIFY_TIME_MS 120000u
 /* Revolutions, from the begin on. */
 #define IDENTIFY_TRAVEL_REV 256

@@ -30,7 +30,7 @@ _ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
 _DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
 """Deviations of weak priors, for what a machine may not show."""
 _BEGIN_PART = 0.03
-_MOST = 0.5
+_MOST = 0.25
 """Part of the pulses that may end at less than the map."""
 _INITIAL_PART, _LEAST_PART = 0.1, 0.1
 """The least incremental inductance is that part of the one of the unaligned phase, which is read at that part of the

@@ -7,7 +7,7 @@ a pulse, and one in a millisecond between (firmware/control/identify.h). A lost 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
@@ -33,11 +33,15 @@ LIMITS = ("none", "a current is more than 3 % beyond current_limit_A", "a windin
           "the rotor has turned by 256 revolutions", "they last longer than 120 s",
           "the parameter controller must be salient")
 """Reasons by identify_limit_t."""
+HOLD_RECORD_S, LOSS_MS = 0.5e-3, 1000
+"""Time between two records of a hold; IDENTIFY_ENERGY_MS."""
 _EVENT_IDENTIFY = 3
 _TIMESTAMP = 0x10
 _ANGLE_BITS, _NUMBER_MASK = 20, 15
 _STEP_NS = 500_000
 _KEEP_ALIVE_NS = 4_000_000_000
+_ANSWER_NS = 50_000_000
+"""Longest time to the first record of an experiment."""
 
 
 class IdentifyError(RunFailed):
@@ -93,6 +97,12 @@ class Link:
 
     def _member(self, path: str) -> int:
         return _member(self._master, self._variables, path)
+
+    def loss_part(self, phases: Collection[int]) -> float:
+        """Copper loss of the warmest winding so far, part of what the drive permits (firmware/control/identify.c)."""
+        limit_q1 = round(self.limit_A / self._current_A) >> 8
+        most = limit_q1**2 // 2 * round(1e-3 / self.period_s) * LOSS_MS
+        return max(self._member(f"identify.energy[{phase}]") for phase in phases) / most
 
     def check(self) -> None:
         """IdentifyError: a limit or a fault has ended the experiments, or records were lost."""
@@ -158,7 +168,8 @@ class Link:
         number = self._session.drive.begin_experiment(experiment) & _NUMBER_MASK
         begin_ns = self._session.time_ns
         parts: list[np.ndarray] = []
-        while self._session.time_ns - begin_ns < round(1e9 * timeout_s):
+        end_ns = begin_ns + round(1e9 * timeout_s)
+        while self._session.time_ns < end_ns or (not parts and self._session.time_ns < begin_ns + _ANSWER_NS):
             part = self._advance()
             part = part[part["number"] == number]
             if len(part):

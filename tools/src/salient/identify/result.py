@@ -29,6 +29,8 @@ _INTERVAL = 1.96
 MAP_ANGLES, MAP_CURRENTS = 61, 48
 _REST_FLUX = 1e-6
 """Least rise between two points of a map, of its largest flux linkage."""
+_LEAST_SLOPE = 0.1
+"""Least incremental inductance by the one of the unaligned phase, as in the fit."""
 _FLAT_RESISTANCE, _FLAT_INERTIA, _FLAT_ANGLE_DEG, _FLAT_FLUX = 0.005, 0.02, 0.02, 0.001
 """Half widths of intervals up to which a quantity counts as determined."""
 _NEAR_LIMIT = 0.9
@@ -113,7 +115,7 @@ def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = S
 def rising(flux_Wb: np.ndarray) -> np.ndarray:
     """The map nearest to a map in its points that falls from aligned to unaligned and rises with the current, as far as
     means of what contradicts it and of its neighbours go: the mean of the upper and the lower monotonic envelope."""
-    least = _REST_FLUX * float(flux_Wb.max())
+    least = max(_REST_FLUX * float(flux_Wb.max()), _LEAST_SLOPE * float(flux_Wb[-1].max()) / flux_Wb.shape[1])
     ramp = least * np.arange(1, flux_Wb.shape[1] + 1)
 
     def monotonic(of: np.ndarray, axis: int) -> np.ndarray:
@@ -233,7 +235,7 @@ def _to_limit(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     slope = (flux[:, -1] - flux[:, -3]) / (current[:, -1] - current[:, -3])
     more = flux[:, -1] + slope * (result.limit_A - largest_A)
     return (np.hstack([angle, angle[:, -1:]]), np.hstack([current, np.full((len(current), 1), result.limit_A)]),
-            np.hstack([flux, more[:, None]]))
+            rising(np.hstack([flux, more[:, None]])))
 
 
 def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:

@@ -6,20 +6,24 @@ are found first, coarsely, because the pulses of the map are chosen by them.
 3. Pulses to the limit from every angle of every phase while the rotor drifts: phase and window are chosen so that their
    torque keeps the speed. One phase alone carries current.
 4. Spin-up by pulses, and coasting: inertia and friction.
+
+A load that turns the rotor by itself is found at rest. Then step 2 is small pulses on the turning rotor, whose rise of
+the current shows the inductances by the angle: a hold would have to be stronger than the load. Pulses against the load
+keep the speed of all that follows, and coasting is through standstill.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from salient.bench.drive import Experiment
-from salient.identify.link import CHARGES, RESTS, IdentifyError, Link
+from salient.identify.link import CHARGES, HOLD_RECORD_S, ON, RESTS, IdentifyError, Link
 
-PULSE_LEVEL, HOLD_LEVEL, PROBE_LEVEL = 4095 / 4096, 0.3, 0.1
+PULSE_LEVEL, PUSH_LEVEL, HOLD_LEVEL, TURNING_LEVEL, PROBE_LEVEL = 4095 / 4096, 0.5, 0.3, 0.25, 0.1
 _STILL = 0.003 / (2.0 * math.pi)
 """Rotation below which the rotor has not moved, of a revolution."""
 _QUIET = 0.02
@@ -29,9 +33,24 @@ _FREEWHEEL_MS = 50
 _LATENCY_S = 2.5e-3
 _SLOWEST, _FASTEST = 0.7, 1.2
 """Parts of the drift speed, between which it is kept."""
-_PATIENCE_S = 0.05
-"""Wait for a window that is worth one pulse more of it."""
-_SPIN_UP_MAX_S, _COAST_S = 2.5, 1.0
+_PATIENCE_S, _PATIENCE_LOADED_S = 0.05, 0.01
+"""Wait for a window that is worth one pulse more of it; also while a load changes the speed."""
+_LOSS_PART, _ENOUGH = 0.65, 0.95
+"""Part of the copper loss that the drive permits, at which the map ends, and of the windows that it needs."""
+_SPIN_UP_MAX_S, _COAST_S, _COAST_STEP_S = 2.5, 1.0, 0.01
+_REST_S, _REST_LOADED_S = 0.02, 0.005
+_DRIFT_LOADED_S = 0.03
+"""Time in which a load would stop the drifting rotor, at least."""
+_PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 1.5, 6, 3.0
+"""Electrical periods and pulses of each phase that show the inductances of a turning rotor; at most that long."""
+_PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
+"""Duration of a push; at most that part of an electrical period, so that its torque keeps its sign."""
+_SMALL_PART = 0.2
+"""Current at which no iron is saturated, of the limit."""
+_PLACES = 24
+"""Places in an electrical period whose mean inductances count alike."""
+_LEAST_SALIENCY = 0.2
+"""Amplitude of the inductance by its mean, below which it does not vary with the angle."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +91,10 @@ class Sequence:
         self.found = Findings([], rotor_poles, np.zeros(phases), np.zeros(phases))
         self._phases = phases
         self._driving = True
+        self._load = 0.0
+        """Acceleration by a load that turns the rotor, rev/s^2; 0 of a rotor that stays where it is."""
+        self._pushed: int | None = None
+        """Phase of the last push, whose current may not have ended."""
 
     # --- rest, windings -------------------------------------------------------------------------------------------
 
@@ -79,7 +102,10 @@ class Sequence:
         """Offsets of the sensors by phase, and which phases have a winding. IdentifyError: less than three."""
         self.tell("rest: offsets of the current sensors; a pulse of each phase: which have a winding")
         for phase in range(self._phases):
-            log = self.link.run(Experiment("rest", phase), 0.02)
+            log = self.link.run(Experiment("rest", phase), _REST_LOADED_S)
+            self._find_load()
+            if not self._load:
+                log = np.concatenate([log, self.link.run(Experiment("rest", phase), _REST_S - _REST_LOADED_S)])
             log = log[(log["phase"] == phase)]
             self.found.offset_A[phase] = log["current_A"].mean() if len(log) else 0.0
             self.found.noise_A[phase] = log["current_A"].std() if len(log) else 0.0
@@ -90,6 +116,13 @@ class Sequence:
         if len(self.found.phases) < self._phases:
             missing = ", ".join("abcdef"[phase] for phase in range(self._phases) if phase not in self.found.phases)
             raise IdentifyError(f"phase {missing}: no current at full voltage: no winding, or no switch")
+
+    def _find_load(self) -> None:
+        """By the records so far, all of them at rest."""
+        log = self.link.log
+        if np.ptp(log["turn"]) > _STILL:
+            time_s = (log["time_us"] - log["time_us"][-1]) * 1e-6
+            self._load = 2.0 * float(np.polyfit(time_s, log["turn"], 2)[0])
 
     def _pulse(self, experiment: Experiment, timeout_s: float = 0.3, keep: bool = True, mapped: bool = False
                ) -> np.ndarray:
@@ -104,6 +137,9 @@ class Sequence:
     def align(self) -> None:
         """Positions and order of the phases; pulses of long freewheeling at each. IdentifyError: they contradict the
         number of poles."""
+        if self._load:
+            self._align_turning()
+            return
         self.tell(f"hold: each phase pulls the rotor with {HOLD_LEVEL:.0%} of the limit and is damped: order, "
                   "direction, angles")
         phases = [*self.found.phases, self.found.phases[0]]
@@ -114,7 +150,13 @@ class Sequence:
                 self.link.run(Experiment("hold", self._other(phases, number), HOLD_LEVEL), 0.05)
                 place, moved = self._settle(phase)
             places.append(place)
+            self.link.rest(0.01)
             self._resistance(phase)
+        self._order(places)
+        self.found.wired_us = int(self.link.log["time_us"][-1])
+
+    def _order(self, places: list[float]) -> None:
+        """Positions and order of the phases by where each of them is aligned, rev."""
         stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
         for phase, place in zip(self.found.phases, places, strict=False):
             strokes = (place - places[0]) / stroke
@@ -123,7 +165,56 @@ class Sequence:
         if sorted(self.found.order.values()) != list(range(len(self.found.phases))):
             raise IdentifyError(f"the phases pull the rotor to {', '.join(f'{360 * place:.2f}' for place in places)} "
                                 f"degrees: not those of {self.found.rotor_poles} rotor poles, or the rotor is blocked")
-        self.found.wired_us = int(self.link.log["time_us"][-1])
+
+    def _align_turning(self) -> None:
+        """As align, of a rotor that the load turns: the inductance of a phase is largest where it is aligned."""
+        link, found = self.link, self.found
+        self.tell(f"a load turns the rotor, {60.0 * self._load:+.0f} r/min a second: small pulses show the inductances "
+                  "by the angle: order, direction, angles")
+        small_A = _SMALL_PART * link.limit_A
+        shown: dict[int, list[tuple[float, float]]] = {phase: [] for phase in found.phases}
+        begin, begin_s, level = float(link.log["turn"][-1]), link.time_s, PROBE_LEVEL
+        while level == PROBE_LEVEL or min(map(len, shown.values())) < _PROBES:
+            if link.time_s - begin_s > _PROBE_MAX_S:
+                raise IdentifyError("a load turns the rotor, but too slowly to show its poles")
+            for phase in found.phases:
+                shown[phase] += inductance_of(self._pulse(Experiment("pulse", phase, level), keep=False), small_A)
+            if abs(float(link.log["turn"][-1]) - begin) * found.rotor_poles > _PROBE_PERIODS:
+                level = TURNING_LEVEL  # where even a period at full voltage is too long for the smaller one
+        self._order([self._aligned(phase, shown[phase]) for phase in found.phases])
+        for phase in found.phases:
+            for part in (0.25, 0.5, 1.0):
+                self._settle_speed()
+                self._freewheel(phase, part)
+        self._settle_speed()
+        found.wired_us = int(link.log["time_us"][-1])
+
+    def _refine(self) -> None:
+        """Angles of the phases by the first rise of all pulses of the map: friction or a load keeps a held rotor from
+        the aligned position, and the fit converges from near it."""
+        found, small_A = self.found, _SMALL_PART * self.link.limit_A
+        for phase in found.phases:
+            shown = [each for pulse in found.pulses if pulse.phase == phase and pulse.mapped
+                     for each in inductance_of(pulse.log, small_A)]
+            moved = (self._aligned(phase, shown) - found.position[phase]) * found.rotor_poles
+            found.position[phase] += math.remainder(moved, 1.0) / found.rotor_poles
+
+    def _aligned(self, phase: int, shown: Collection[tuple[float, float]]) -> float:
+        """Where the inductance of a phase is largest, rev, by its first harmonic. IdentifyError: it does not vary."""
+        if len(shown) < _PROBES:
+            raise IdentifyError(f"phase {'abcdef'[phase]}: no rise of the current to see its inductance by")
+        turn, inductance = np.array(list(shown)).T
+        place = np.round(turn * self.found.rotor_poles * _PLACES) % _PLACES
+        known = np.unique(place)
+        inductance = np.array([inductance[place == each].mean() for each in known])  # many pulses at a place are one
+        angle = np.array([np.angle(np.exp(2j * math.pi * self.found.rotor_poles * turn[place == each]).mean())
+                          for each in known])
+        design = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+        mean, cosine, sine = np.linalg.lstsq(design, inductance, rcond=None)[0]
+        if math.hypot(cosine, sine) < _LEAST_SALIENCY * mean:
+            raise IdentifyError(f"phase {'abcdef'[phase]}: its inductance does not vary with the angle of "
+                                f"{self.found.rotor_poles} rotor poles")
+        return math.atan2(sine, cosine) / (2.0 * math.pi * self.found.rotor_poles)
 
     @staticmethod
     def _other(phases: list[int], number: int) -> int:
@@ -137,9 +228,9 @@ class Sequence:
     def _settle(self, phase: int) -> tuple[float, float]:
         """Where a phase holds the rotor, and how far that was, rev."""
         turns = self._hold(phase, _HOLD_S, None)
-        while len(turns) * 1e-3 < _HOLD_MAX_S and np.ptp(turns) >= _STILL and len(turning_points(turns)) < 3:
+        while len(turns) * HOLD_RECORD_S < _HOLD_MAX_S and np.ptp(turns) >= _STILL and len(turning_points(turns)) < 3:
             turns = np.concatenate([turns, self._hold(phase, _HOLD_S, None)])
-        moved, span_s = float(np.ptp(turns)), max(len(turns) * 1e-3, 0.1)
+        moved, span_s = float(np.ptp(turns)), max(len(turns) * HOLD_RECORD_S, 0.1)
         quiet = _QUIET / self.found.rotor_poles
         for _ in range(_DAMPED_MAX):
             if np.ptp(turns[len(turns) // 2:]) < quiet:
@@ -149,40 +240,79 @@ class Sequence:
         return float((tail.max() + tail.min()) / 2.0), moved
 
     def _resistance(self, phase: int) -> None:
-        self.link.rest(0.01)
         for part in (0.25, 0.5, 1.0):
-            self._pulse(Experiment("freewheel", phase, part * PULSE_LEVEL, _FREEWHEEL_MS))
+            self._freewheel(phase, part)
+
+    def _freewheel(self, phase: int, part: float) -> None:
+        self._pulse(Experiment("freewheel", phase, part * PULSE_LEVEL, _FREEWHEEL_MS))
 
     # --- map ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def _drift(self) -> float:
+        """Speed of the drifting rotor, rev/s: an electrical revolution in 1/4 s, or more where a load changes it."""
+        return max(1.0 / self.found.rotor_poles / 0.25, abs(self._load) * _DRIFT_LOADED_S)
+
+    def _settle_speed(self) -> None:
+        """Against the load, until the rotor drifts. IdentifyError: the pulses are weaker than the load."""
+        direction, begin_s, log = self._against_load, self.link.time_s, self.link.log
+        while True:
+            speed, turn = self._motion(log)
+            part = speed * direction / self._drift
+            if _SLOWEST < part < 2.0 * _FASTEST:
+                self._end_push()
+                return
+            if self.link.time_s - begin_s > _SPIN_UP_MAX_S:
+                raise IdentifyError("pulses cannot turn the rotor against its load")
+            log = self.link.rest(0.005) if part > _SLOWEST else self._push(direction, speed, turn)
+
+    @property
+    def _against_load(self) -> int:
+        return -1 if self._load > 0.0 else 1
+
+    def _push(self, direction: int, speed: float, turn: float) -> np.ndarray:
+        """A moment of the phase with the most torque in a direction, at half of the limit: a hold, because its records
+        are few, while those of a pulse keep the bus busy for longer than the pulse lasts."""
+        found = self.found
+        duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
+        at = turn + speed * (_LATENCY_S + duration_s) / 2.0
+        phase = max(found.phases, key=lambda each: -direction * math.sin(2.0 * math.pi * found.electrical(each, at)))
+        if found.wired_us:  # from then on the shaft is found by the records
+            self._end_push(phase)
+        self._pushed = phase
+        return self.link.run(Experiment("hold", phase, PUSH_LEVEL), duration_s)
+
+    def _end_push(self, phase: int | None = None) -> None:
+        """Waits for the end of the current of a push before another phase has the records, which have its torque."""
+        if self._pushed not in (None, phase):
+            self.link.run(Experiment("rest", self._pushed), _DECAY_S)
+            self._pushed = None
 
     def map(self, bins: int, repeats: int, max_s: float) -> None:
         """Pulses until each window of each phase has had `repeats`, or for max_s. IdentifyError: the rotor cannot be
         kept turning."""
         found, link = self.found, self.link
-        star = 1.0 / found.rotor_poles / 0.25  # rev/s: an electrical revolution in 1/4 s
+        star = self._drift
         self.tell(f"drift at about {60 * star:.0f} r/min: pulses to the limit from {bins} windows of each phase, "
                   f"{repeats} of each")
         counts = found.counts = np.zeros((len(found.phases), bins), int)
         begin_s, told_s = link.time_s, link.time_s
         log = link.rest(0.01)
-        direction = 1
+        direction = self._against_load
         while counts.min() < repeats and link.time_s - begin_s < max_s:
             speed, turn = self._motion(log)
-            if abs(speed) > 0.05 * star:
+            if abs(speed) > 0.05 * star and not self._load:
                 direction = 1 if speed > 0 else -1
-            sign = direction if self._drives(abs(speed) / star) else -direction
-            choice = self._choose(counts, star, speed, turn, direction, sign)
-            if choice is None:
-                raise IdentifyError("no phase can move the rotor")
-            row, window, arrival_s, at_once = choice
-            phase = found.phases[row]
-            if at_once:
-                log = self._pulse(Experiment("pulse", phase, PULSE_LEVEL), mapped=True)
-            else:
-                log = self._pulse(self._windowed(phase, window, bins, turn, direction),
-                                  timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
+            drives = self._drives(speed * direction / star)
+            if abs(speed) < 0.2 * star or (drives and (self._load or self._lacks_braking(counts, direction))):
+                log = self._push(direction, speed, turn)
+                continue
+            self._end_push()
+            window, log = self._measure(counts, star, speed, turn, direction)
             fired = log[log["state"] == CHARGES]
             if len(fired):
+                phase = int(fired["phase"][0])
+                row = found.phases.index(phase)
                 place = found.electrical(phase, float(fired["turn"][0])) * bins
                 # A pulse at the edge of a window is one of it, wherever the encoder's count begins.
                 near = abs((place - window - 0.5 + bins / 2.0) % bins - bins / 2.0) < 0.75
@@ -190,9 +320,25 @@ class Sequence:
             log = log if len(log) > 4 else link.rest(0.003)
             if link.time_s - told_s > 2.0:
                 told_s = link.time_s
+                if link.loss_part(found.phases) > _LOSS_PART and np.mean(counts > 0) > _ENOUGH:
+                    self.tell("  the windings have had most of their copper loss: the map ends here")
+                    break
                 self.tell(f"  {counts.clip(max=repeats).sum()} of {counts.size * repeats} windows, "
                           f"{60 * speed:+.0f} r/min")
         found.mapped_us = int(link.log["time_us"][-1])
+        self._refine()
+
+    def _measure(self, counts: np.ndarray, star: float, speed: float, turn: float, direction: int
+                 ) -> tuple[int, np.ndarray]:
+        """A pulse from a window that has had few; its torque keeps the speed, unless a load brakes. Window and records.
+        IdentifyError: the rotor cannot be moved."""
+        sign = 0 if self._load else direction if self._driving else -direction
+        choice = self._choose(counts, star, speed, turn, direction, sign)
+        if choice is None:
+            raise IdentifyError("no phase can move the rotor")
+        row, window, arrival_s = choice
+        return window, self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
+                                   timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
 
     def _drives(self, speed: float) -> bool:
         """Whether the next pulse is to drive, by the speed, part of the drift speed: until it is above 1.2 of it, and
@@ -200,6 +346,14 @@ class Sequence:
         if speed > _FASTEST or speed < _SLOWEST:
             self._driving = speed < _SLOWEST
         return self._driving
+
+    @staticmethod
+    def _lacks_braking(counts: np.ndarray, direction: int) -> bool:
+        """The windows whose torque drives have had their pulses, those whose torque brakes have not: speed is needed
+        for them, and no further pulse of a certain window."""
+        bins = counts.shape[1]
+        half = slice(bins // 2, bins) if direction > 0 else slice(0, bins // 2)
+        return bool(counts[:, half].min() >= counts.mean() - 0.5)
 
     def _windowed(self, phase: int, window: int, bins: int, turn: float, direction: int) -> Experiment:
         """A pulse at the next passage of a window: its begin in the direction of counting."""
@@ -220,51 +374,73 @@ class Sequence:
         return float(np.polyfit(time_s, part["turn"], 1)[0]), float(part["turn"][-1])
 
     def _choose(self, counts: np.ndarray, star: float, speed: float, turn: float, direction: int, sign: int
-                ) -> tuple[int, int, float, bool] | None:
-        """Row and window of the next pulse, the time to it, and whether it is one at once: of those whose torque has
-        the sign, that with few pulses which comes soon."""
+                ) -> tuple[int, int, float] | None:
+        """Row and window of the next pulse, and the time to it: of those whose torque has the sign, or of all with a
+        sign of 0, that with few pulses which comes soon."""
         found, bins = self.found, counts.shape[1]
-        half = slice(bins // 2, bins) if direction > 0 else slice(0, bins // 2)
-        slow, weak = abs(speed) < 0.2 * star, self._driving and bool(counts[:, half].min() >= counts.mean() - 0.5)
-        best: tuple[float, int, int, float, bool] | None = None
+        best: tuple[float, int, int, float] | None = None
         for row, phase in enumerate(found.phases):
             place = found.electrical(phase, turn + speed * _LATENCY_S)
             for window in range(bins):
                 centre = (window + 0.5) / bins
-                if (-1 if centre < 0.5 else 1) != sign:
+                if sign and (-1 if centre < 0.5 else 1) != sign:
                     continue
                 ahead = (direction * (centre - place)) % 1.0
                 arrival_s = ahead / found.rotor_poles / max(abs(speed), 0.2 * star)
-                cost = counts[row, window] + arrival_s / _PATIENCE_S
-                if weak:  # the rotor has to gain speed
-                    cost += 4.0 * math.cos(2.0 * math.pi * centre) ** 2
-                if slow:
-                    if math.sin(2.0 * math.pi * centre) ** 2 < 0.1:
-                        continue
-                    cost = counts[row, window] + 100.0 * min(ahead, 1.0 - ahead)
+                cost = counts[row, window] + arrival_s / (_PATIENCE_LOADED_S if self._load else _PATIENCE_S)
                 if best is None or cost < best[0]:
-                    best = (cost, row, window, arrival_s, slow)
+                    best = (cost, row, window, arrival_s)
         return None if best is None else best[1:]
 
     # --- shaft -------------------------------------------------------------------------------------------------------
 
     def spin(self, speed_rpm: float) -> None:
         """Spins the rotor up by pulses, and lets it coast."""
-        link, found = self.link, self.found
+        link = self.link
         self.tell(f"spin-up to {speed_rpm:.0f} r/min, coasting for {_COAST_S:g} s: inertia, friction")
-        begin_s = link.time_s
-        log = link.rest(0.005)
-        while link.time_s - begin_s < _SPIN_UP_MAX_S:
-            speed, turn = self._motion(log)
-            if abs(speed) * 60.0 >= speed_rpm:
+        speed_rpm = max(speed_rpm, 2.0 * 60.0 * self._drift) if self._load else speed_rpm
+        coasted_s, begin_s = 0.0, link.time_s
+        while coasted_s < _COAST_S:
+            log = link.rest(0.005)
+            while link.time_s - begin_s < _SPIN_UP_MAX_S:
+                speed, turn = self._motion(log)
+                direction = self._against_load if self._load else 1 if speed >= 0.0 else -1
+                if speed * direction * 60.0 >= speed_rpm:
+                    break
+                log = self._push(direction, speed, turn)
+            self._end_push()
+            coasted_s += self._coast(_COAST_S - coasted_s)
+            if link.time_s - begin_s >= _SPIN_UP_MAX_S:
                 break
-            direction = 1 if speed >= 0.0 else -1
-            at = turn + speed * _LATENCY_S
-            phase = max(found.phases, key=lambda each: -direction * math.sin(
-                2.0 * math.pi * found.electrical(each, at)))
-            log = self._pulse(Experiment("pulse", phase, PULSE_LEVEL))
-        link.rest(_COAST_S)
         link.check()
+
+    def _coast(self, duration_s: float) -> float:
+        """Lets the rotor coast; with a load until it drifts the other way. Returns the time."""
+        if not self._load:
+            self.link.rest(duration_s)
+            return duration_s
+        begin_s = self.link.time_s
+        while self.link.time_s - begin_s < duration_s:
+            speed, _ = self._motion(self.link.rest(_COAST_STEP_S))
+            if -speed * self._against_load > self._drift:
+                break
+        return self.link.time_s - begin_s
+
+
+def inductance_of(log: np.ndarray, small_A: float = math.inf) -> list[tuple[float, float]]:
+    """Angle of the encoder, rev, and inductance, H, by the first rise of the current in a pulse, up to a current that is
+    small enough to take the rotor for standing and the iron for not saturated; none without a rise."""
+    on = log["action"] == ON
+    first = int(on.argmax())
+    end = first + int((~on[first:]).argmax())  # the record at which both switches are no longer on
+    if end == first:
+        return []
+    part = log[first:end + 1]
+    part = part[:max(2, int(np.searchsorted(part["current_A"], small_A)))]
+    rise_A, time_s = float(part["current_A"][-1] - part["current_A"][0]), 1e-6 * float(np.ptp(part["time_us"]))
+    if rise_A <= 0.0 or time_s <= 0.0:
+        return []
+    return [(float(part["turn"].mean()), float(part["dc_link_V"].mean()) * time_s / rise_A)]
 
 
 def turning_points(turns: np.ndarray) -> np.ndarray:

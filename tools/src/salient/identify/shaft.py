@@ -52,14 +52,13 @@ def shaft_of(found: Findings, fit: Fit, log: np.ndarray) -> Shaft:
     log = log[log["time_us"] > found.wired_us]
     time_s = (log["time_us"] - log["time_us"][0]) * 1e-6
     angle = fit.shaft_rad(2.0 * math.pi * log["turn"])
-    # Impulse of the torque between two records, by Simpson's rule, at their mean time; none of it in the milliseconds
-    # without a pulse.
+    # Impulse of the torque between two records, by Simpson's rule, at their mean time.
     middle = log[:-1].copy()
     for name in ("current_A", "turn"):
         middle[name] = (log[name][1:] + log[name][:-1]) / 2.0
     torque, between = torque_of(found, fit, log), torque_of(found, fit, middle)
     gap_s = np.diff(time_s)
-    impulse = (torque[1:] + 4.0 * between + torque[:-1]) / 6.0 * np.where(gap_s < 0.5e-3, gap_s, 0.0)
+    impulse = (torque[1:] + 4.0 * between + torque[:-1]) / 6.0 * gap_s
     impulse_s = (time_s[1:] + time_s[:-1]) / 2.0
     rows, right = _equations(time_s, angle, impulse_s[impulse != 0.0], impulse[impulse != 0.0])
     if len(right) < 8 * _RUN:
