@@ -239,7 +239,7 @@ TEST_F(Identify, each_limit_ends_all_experiments_until_the_next_run) {
     expect_off();
 }
 
-TEST_F(Identify, the_copper_loss_of_half_a_second_at_the_limit_is_its_end) {
+TEST_F(Identify, the_copper_loss_of_a_second_at_the_limit_is_its_end) {
     current_q9[1] = LIMIT_Q9;
     unsigned periods = 0;
     phase = 0;
@@ -247,7 +247,7 @@ TEST_F(Identify, the_copper_loss_of_half_a_second_at_the_limit_is_its_end) {
         step();
         periods++;
     }
-    EXPECT_NEAR(periods, 500 * 40, 2);
+    EXPECT_NEAR(periods, 1000 * 40, 2);
 }
 
 TEST_F(Identify, travel_is_counted_over_revolutions) {
