@@ -6,7 +6,7 @@
 #include "plant/pwm_timer.h"
 
 uint32_t half_bridge_shortest_ticks(double minimum_pulse_ns) {
-    return (uint32_t)fmin(ceil(minimum_pulse_ns * (0.5 / PWM_TIMER_TICK_NS)), UINT16_MAX);
+    return (uint32_t)fmin(ceil(minimum_pulse_ns * (0.5 / PWM_TIMER_TICK_REAL_NS)), UINT16_MAX);
 }
 
 /* Suppresses a pulse, or the gap between two pulses, that is too short: the compare value becomes 0 or the period. */

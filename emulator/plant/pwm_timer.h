@@ -12,12 +12,11 @@
 #define PWM_TIMER_CLOCK_HZ (SALIENT_PWM_CLOCK_MHZ * 1000000)
 #define PWM_TIMER_NS_PER_US 1000u
 
-/* Length of a tick: an integer where it is whole. */
+/* Length of a tick; as an integer where it is whole. */
 #if 1000 % SALIENT_PWM_CLOCK_MHZ == 0
 #define PWM_TIMER_TICK_NS (1000 / SALIENT_PWM_CLOCK_MHZ)
-#else
-#define PWM_TIMER_TICK_NS (1000.0 / SALIENT_PWM_CLOCK_MHZ)
 #endif
+#define PWM_TIMER_TICK_REAL_NS (1000.0 / SALIENT_PWM_CLOCK_MHZ)
 
 /* Time after as many ticks, to the nearest nanosecond. ticks < 2^54. */
 static inline uint64_t pwm_timer_ns(uint64_t ticks) {

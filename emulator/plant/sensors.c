@@ -231,7 +231,7 @@ static void capture_edges(sensors_t *sensors, const plant_t *plant, int64_t p1) 
 }
 
 static uint32_t edge_age_ticks(const sensors_t *sensors, const plant_t *plant) {
-    const double ticks = ((double)plant->time_ns - sensors->edge.time_ns) / PWM_TIMER_TICK_NS;
+    const double ticks = ((double)plant->time_ns - sensors->edge.time_ns) / PWM_TIMER_TICK_REAL_NS;
     return ticks >= (double)HAL_ENCODER_AGE_MAX_TICKS ? HAL_ENCODER_AGE_MAX_TICKS : (uint32_t)(fmax(ticks, 0.0) + 0.5);
 }
 

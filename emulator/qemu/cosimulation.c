@@ -25,8 +25,6 @@
 #define FLIP_OBJECTS ((1u << MEMORY_OBJECTS) - 1u)
 #define RIG_STACK_BYTES (1024 * 1024)
 
-static_assert(MAILBOX_PWM_CLOCK_HZ == PWM_TIMER_CLOCK_HZ, "one clock on both sides of the mailbox");
-
 static uint8_t *shared; /* the image's mailbox: that below, with its arrays of phases */
 static mailbox_t copy_of_shared, *const mailbox = &copy_of_shared;
 static simulation_t simulation;

@@ -41,7 +41,7 @@ static uint16_t code_at(int pin) {
                                   : 0;
 }
 
-static uint16_t analog(void *context, unsigned adc, unsigned channel) {
+static uint16_t analogue(void *context, unsigned adc, unsigned channel) {
     (void)context;
     const int pin = channel < CHANNELS ? pin_of_channel[adc][channel] : WIRING_NONE;
     if (pin < 0 || !gpio_is_analog((unsigned)pin)) {
@@ -279,7 +279,7 @@ void bench_io_open(board_t *of, const wiring_t *pins) {
     board = of;
     wiring = *pins;
     find_channels();
-    adc_set_input(analog, NULL);
+    adc_set_input(analogue, NULL);
     fdcan_join(&(fdcan_bus_t){.send = send,
                               .pending = pending,
                               .cancel = cancel,

@@ -11,7 +11,7 @@
 #include "stm32g4/wiring.h"
 
 /* Joins both; keeps them. */
-void bench_io_open(board_t *board, const wiring_t *wiring);
+void bench_io_open(board_t *of, const wiring_t *pins);
 
 /* Levels of the lines and pins after a reset of the part; the encoder counts from 0 to its position, as at power-up. */
 void bench_io_reset(void);

@@ -36,10 +36,10 @@ void cpu_load(const char *path);
 void cpu_reset(void);
 
 /* Runs until the cycle, BKPT, or, with `to_sleep`, until the processor sleeps with nothing to wake it. */
-void cpu_run(uint64_t until, bool to_sleep);
+void cpu_run(uint64_t end, bool to_sleep);
 
 /* The processor does not execute until the cycle (a stall of the flash). */
-void cpu_stall(uint64_t until);
+void cpu_stall(uint64_t to);
 
 uint32_t cpu_program_counter(void);
 

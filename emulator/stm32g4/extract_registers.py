@@ -11,9 +11,8 @@ import sys
 from pathlib import Path
 
 INSTANCES = ["TIM1", "TIM8", "TIM2", "TIM3", "TIM4", "TIM5", "TIM6", "TIM7", "RCC", "PWR", "FLASH", "GPIOA", "GPIOB",
-             "GPIOC", "GPIOD", "ADC1", "ADC2", "ADC3", "ADC4", "ADC5", "ADC12_COMMON", "ADC345_COMMON", "DAC1", "DAC2", "DAC3",
-             "DAC4",
-             "COMP", "DMA1", "DMA2", "DMAMUX", "FDCAN1", "IWDG", "LPTIMER1", "RNG", "EXTI", "SYSCFG"]
+             "GPIOC", "GPIOD", "ADC1", "ADC2", "ADC3", "ADC4", "ADC5", "ADC12_COMMON", "ADC345_COMMON", "DAC1", "DAC2",
+             "DAC3", "DAC4", "COMP", "DMA1", "DMA2", "DMAMUX", "FDCAN1", "IWDG", "LPTIMER1", "RNG", "EXTI", "SYSCFG"]
 # (register name) -> corrections of reset value, readable, writable bits; the crate is wrong, or leaves bits out.
 CORRECTIONS = {
     "IWDG_RLR": {"reset": 0xFFF},

@@ -21,18 +21,18 @@
 
 static uint16_t codes[CONVERTERS][CHANNELS];
 
-static uint16_t analog(void *context, unsigned adc, unsigned channel) {
+static uint16_t analogue(void *context, unsigned adc, unsigned channel) {
     (void)context;
     return channel < CHANNELS ? codes[adc][channel] : 0;
 }
 
 static int usage(const char *program) {
     printf(
-        "usage: %s IMAGE.elf --alone [--wire PIN=PIN] [--analog PIN=CODE] [--trace FILE PIN...] [--limit-us N]\n"
+        "usage: %s IMAGE.elf --alone [--wire PIN=PIN] [--analogue PIN=CODE] [--trace FILE PIN...] [--limit-us N]\n"
         "       %s IMAGE.elf --wiring FILE [--mistake REGISTER,CLEAR,SET]... OPTION...\n"
         "  --alone              no bench: until BKPT, whose R0 is the exit code\n"
         "  --wire PIN=PIN       joins two pins, as PA0=PB3\n"
-        "  --analog PIN=CODE    converters read this code of 12 bits at the pin, comparators its part of 3.3 V\n"
+        "  --analogue PIN=CODE    converters read this code of 12 bits at the pin, comparators its part of 3.3 V\n"
         "  --trace FILE PIN...  writes time in cycles of HCLK, pin and level for each edge; the last option\n"
         "  --limit-us N         ends the run with exit code 124 after this virtual time\n"
         "  --wiring FILE        on the bench: a signal and a pin in each line\n"
@@ -72,7 +72,7 @@ static int set_analog(const char *value) {
     const int pin = pin_of(value);
     const unsigned long code = equals ? strtoul(equals + 1, NULL, 10) : 4096;
     if (pin < 0 || code > 4095) {
-        return mistake("--analog", value);
+        return mistake("--analogue", value);
     }
     for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
         if (row->pin == (unsigned)pin && strncmp(row->peripheral, "ADC", 3) == 0 &&
@@ -86,12 +86,12 @@ static int set_analog(const char *value) {
 
 static int alone(int argc, char *argv[]) {
     uint64_t limit_us = LIMIT_DEFAULT_US;
-    for (int i = 3; i < argc; ++i) {
+    for (int i = 3; i < argc; i += 2) {
         int error = 0;
         const char *value = i + 1 < argc ? argv[i + 1] : "";
         if (strcmp(argv[i], "--wire") == 0) {
             error = wire(value);
-        } else if (strcmp(argv[i], "--analog") == 0) {
+        } else if (strcmp(argv[i], "--analogue") == 0) {
             error = set_analog(value);
         } else if (strcmp(argv[i], "--limit-us") == 0) {
             limit_us = strtoull(value, NULL, 10);
@@ -114,9 +114,8 @@ static int alone(int argc, char *argv[]) {
         if (error) {
             return error;
         }
-        ++i;
     }
-    adc_set_input(analog, NULL);
+    adc_set_input(analogue, NULL);
     for (;;) {
         const uint64_t end = soc_cycle_of_ns(limit_us * 1000);
         cpu_run(end, false);

@@ -338,11 +338,10 @@ static void control_write(uint32_t offset, uint32_t value) {
     case 0xED14:
         nvic.ccr = value;
         break;
-    case 0xED24:
-        break; /* a fault ends the run, enabled or not */
-    case 0xED28:
+    case 0xED24: /* a fault ends the run, enabled or not */
+    case 0xED28: /* write one to clear, nothing is set */
     case 0xED2C:
-        break; /* write one to clear, nothing is set */
+        break;
     case 0xEDFC:
         nvic.demcr = value;
         break;

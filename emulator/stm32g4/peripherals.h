@@ -42,7 +42,7 @@ const char *gpio_name(unsigned pin);
 typedef enum { TIM1, TIM2, TIM3, TIM4, TIM5, TIM6, TIM7, TIM8, TIMERS } timer_number_t;
 void timer_attach(void);
 void timer_reset(void);
-void timer_event(unsigned timer);
+void timer_event(unsigned number);
 void timer_input(unsigned pin, bool level);   /* an input of a port has changed */
 bool timer_clears_by_zeros(uint32_t address); /* a status register, to which ones may be written anywhere */
 void timer_break_changed(void);               /* a source of a break, or its routing, has changed */
@@ -61,14 +61,14 @@ unsigned timer_edges(unsigned pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_M
 /* --- Converters (21): adc.c --- */
 void adc_attach(void);
 void adc_reset(void);
-void adc_event(unsigned adc);
+void adc_event(unsigned number);
 void adc_trigger(unsigned source); /* an internal trigger: TIM1_TRGO and others, adc.c */
 typedef uint16_t (*adc_input_t)(void *context, unsigned adc, unsigned channel); /* 0..4095 */
-void adc_set_input(adc_input_t input, void *context);
+void adc_set_input(adc_input_t function, void *context);
 /* The instant at which converter 0 sampled last, for the bench. */
 uint64_t adc_sampled_at(unsigned adc);
 
-/* --- Comparators and their references (22, 24): analog.c --- */
+/* --- Comparators and their references (22, 24): analogue.c --- */
 void analog_attach(void);
 void analog_reset(void);
 bool analog_comparator(unsigned comparator);     /* 0..6: COMP1 to COMP7, after polarity */
@@ -78,7 +78,7 @@ void analog_set_pin(unsigned pin, double volts); /* of a pin, for comparators */
 /* --- DMA (12, 13): dma.c --- */
 void dma_attach(void);
 void dma_reset(void);
-void dma_request(unsigned line); /* of DMAMUX, table 91 */
+void dma_request(unsigned request); /* of DMAMUX, table 91 */
 
 /* --- CAN (44): fdcan.c --- */
 typedef struct {

@@ -123,8 +123,8 @@ void timer_output_write(tim_t *timer, uint32_t offset, uint32_t value);
 void timer_break(tim_t *timer, uint32_t flag);
 
 /* Input side, timer_input.c. */
-void timer_input_trigger(tim_t *timer);                  /* the selected trigger, TRGI */
-void timer_trigger_out(const tim_t *timer, bool second); /* TRGO, TRGO2 */
+void timer_input_trigger(tim_t *timer);                   /* the selected trigger, TRGI */
+void timer_trigger_out(const tim_t *source, bool second); /* TRGO, TRGO2 */
 bool timer_is_encoder(const tim_t *timer);
 bool timer_is_external(const tim_t *timer);
 void timer_capture(tim_t *timer, unsigned channel);
@@ -138,7 +138,7 @@ void timer_count_external(tim_t *timer, bool down);
 
 /* The outputs of the timer may have changed before its next update: for the bench. */
 typedef void (*timer_watch_t)(void *context);
-void timer_watch(timer_watch_t watch, void *context);
+void timer_watch(timer_watch_t function, void *context);
 void timer_outputs_changed(void);
 
 #endif

@@ -207,9 +207,9 @@ static identify_action_t pulse(const identify_parameters_t *parameters, identify
  * which the voltage or its integral would be another one. */
 static bool is_due(const identify_parameters_t *parameters, identify_t *identify, int32_t current_q9) {
     const bool pulses = identify->state >= IDENTIFY_CHARGES && identify->state <= IDENTIFY_RESTS;
-    const uint32_t spacing = pulses                                ? PULSE_SPACING
+    const uint32_t spacing = pulses                              ? PULSE_SPACING
                              : identify->state == IDENTIFY_HOLDS ? parameters->periods_per_ms / HOLD_RECORDS
-                                                                   : parameters->periods_per_ms;
+                                                                 : parameters->periods_per_ms;
     const bool changed = identify->state != identify->recorded_state || identify->action != identify->recorded_action ||
                          fixed_abs(current_q9 - identify->recorded_q9) > parameters->limit_q9 >> RECORD_SHIFT;
     identify->recorded_periods++;

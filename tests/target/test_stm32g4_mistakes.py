@@ -1,5 +1,5 @@
-"""Mistakes of the port that the model finds before the first control period, planted as altered writes of registers: bits
-that every write of the image to a register clears and sets."""
+"""Mistakes of the port that the model finds before the first control period, planted as altered writes of registers:
+bits that every write of the image to a register clears and sets."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
 from salient.bench.programs import command_line
 from salient.config import BOARD_BUILD, BenchConfig
 
@@ -38,7 +39,8 @@ def _run(tmp_path: Path, *mistakes: str) -> subprocess.CompletedProcess[str]:
     line = command_line(config)
     end = line.index("--wiring") + 2
     planted = [word for mistake in mistakes for word in ("--mistake", mistake)]
-    return subprocess.run([*line[:end], *planted, *line[end:]], capture_output=True, text=True, check=False, timeout=300)
+    return subprocess.run([*line[:end], *planted, *line[end:]], capture_output=True, text=True, check=False,
+                          timeout=300)
 
 
 def test_image_without_a_mistake_breaks_no_rule(tmp_path: Path) -> None:

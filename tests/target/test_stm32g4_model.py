@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+
 from salient.paths import BUILD, ROOT
 
 SOURCES = ROOT / "tests" / "target" / "stm32g4"
@@ -35,7 +36,8 @@ def run(folder: Path, name: str, *options: str, definitions: tuple[str, ...] = (
 
 def passes(result: subprocess.CompletedProcess[str]) -> bool:
     """True when every check of the program held; else the message names the line."""
-    assert result.returncode == 0, f"exit code {result.returncode} (a line of the program, or {VIOLATION}): {result.stderr}"
+    assert result.returncode == 0, (f"exit code {result.returncode}, a line of the program or {VIOLATION}: "
+                                    f"{result.stderr}")
     return True
 
 
@@ -44,7 +46,7 @@ def test_exceptions_come_in_the_order_of_their_priorities(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("name", "options"), [
-    ("adc", ("--analog", "PA0=1234", "--analog", "PA1=3000")),
+    ("adc", ("--analogue", "PA0=1234", "--analogue", "PA1=3000")),
     ("breaks", ("--wire", "PB0=PB12")),
     ("encoder", ("--wire", "PB0=PA0", "--wire", "PB1=PA1", "--wire", "PB2=PA5")),
     ("fdcan", ()),

@@ -428,8 +428,8 @@ class Sequence:
 
 
 def inductance_of(log: np.ndarray, small_A: float = math.inf) -> list[tuple[float, float]]:
-    """Angle of the encoder, rev, and inductance, H, by the first rise of the current in a pulse, up to a current that is
-    small enough to take the rotor for standing and the iron for not saturated; none without a rise."""
+    """Angle of the encoder, rev, and inductance, H, by the first rise of the current in a pulse; none without a rise.
+    small_A: current up to which the rotor stands, and the iron is not saturated."""
     on = log["action"] == ON
     first = int(on.argmax())
     end = first + int((~on[first:]).argmax())  # the record at which both switches are no longer on
