@@ -66,7 +66,7 @@ static unsigned candidate(void) {
 
 /* --- Hooks --- */
 
-/* Cycles and instructions of a block; that of flash is remembered. */
+/* Cycles and instructions of a block; a block of the flash is counted once. */
 static void measure(uint64_t address, uint32_t size, unsigned *cycles, unsigned *instructions) {
     const unsigned wait_states = flash_wait_states();
     const uint64_t slot = (address - FLASH_BASE) / 2;

@@ -72,7 +72,7 @@ const char *gpio_name(unsigned pin) {
 
 /* --- Levels --- */
 
-/* What the pin itself drives; false: nothing. */
+/* Level that the pin itself drives; false: it drives none. */
 static bool own(unsigned pin, bool *level) {
     switch (mode(pin)) {
     case MODE_OUTPUT:

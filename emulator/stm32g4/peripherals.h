@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * What the peripherals of the model offer to each other, and to the bench. Section numbers are those of RM0440.
+ * Functions of the peripherals for each other, and for the bench. Section numbers refer to RM0440.
  */
 #ifndef STM32G4_PERIPHERALS_H
 #define STM32G4_PERIPHERALS_H

@@ -29,7 +29,7 @@ _BUILDERS = {"host": "any tools/salient command",
 _IMAGE_PARTS = ("drive_codec", "salient_firmware", "salient_port", "salient_main")
 """Targets of CMake that images of every machine have in common."""
 BOARD_CLOCK_MHZ = 100
-"""Of the images that the model runs: its ticks are whole nanoseconds, as the plant's."""
+"""Clock of the images that the model runs: its ticks are whole nanoseconds, as the plant's."""
 BOARD_ADC_BITS = 12
 
 

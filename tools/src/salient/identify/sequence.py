@@ -272,7 +272,7 @@ class Sequence:
 
     def _push(self, direction: int, speed: float, turn: float) -> np.ndarray:
         """A moment of the phase with the most torque in a direction, at half of the limit: a hold, because its records
-        are few, while those of a pulse keep the bus busy for longer than the pulse lasts."""
+        are few, while a pulse's keep the bus busy for longer than it lasts."""
         found = self.found
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
         at = turn + speed * (_LATENCY_S + duration_s) / 2.0
