@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from salient.bench.drive import Experiment
+from salient.experiments.identified import CONDITIONS, errors, identified
 from salient.identify.command import identify
 from salient.identify.link import IDLE, IdentifyError, linked
 from salient.identify.result import write_machine
@@ -69,6 +70,20 @@ def test_the_machine_is_found_and_the_name_plate_s_magnetics_are_not_used(identi
     assert result.log["current_A"].max() <= 1.05 * LIMIT_A
     assert pulse_level_A(bench) <= 1.05 * LIMIT_A
     assert bench.time_s < 30.0
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("condition", ["17 bits", "17 bits, load"])
+def test_noise_friction_eccentricity_and_a_load_change_the_result_little(tmp_path, condition):
+    """Noise of 2 LSB, offsets, 0.05 degrees of eccentricity, Coulomb friction of 2 %, load of 20 % of rated torque."""
+    path = machine_path("saturating")
+    result, file, time_s = identified(path, CONDITIONS[condition], tmp_path, lambda _: None)
+    found = errors(load_machine(file), load_machine(path), result)
+    for name, most in (("flux_rms", 0.12), ("flux_max", 1.5), ("torque_rms", 0.5), ("torque_max", 5.0),
+                       ("angle_deg", 0.02), ("resistance", 0.5), ("inertia", 2.0)):
+        assert 1e-6 < abs(found[name]) < most, name
+    assert 95.0 < found["peak"] <= 105.0
+    assert 5.0 < time_s < 30.0
 
 
 def test_only_one_phase_carries_current_and_all_are_off_at_the_end(identifying):

@@ -33,11 +33,13 @@ from salient.machine.path import machine_path, stated_conditions
 from salient.machine.scaling import scaling_of
 from salient.paths import OUT, make_folder
 
+_SENSORS = {"noise_lsb": 2, "offset_lsb": 5, "encoder_eccentricity_deg": 0.05, "coulomb": 0.02}
 CONDITIONS: Mapping[str, Mapping[str, float]] = {
     "ideal": {},
-    "17 bits": {"noise_lsb": 2, "offset_lsb": 5, "encoder_eccentricity_deg": 0.05, "coulomb": 0.02},
-    "14 bits": {"noise_lsb": 2, "offset_lsb": 5, "encoder_eccentricity_deg": 0.05, "coulomb": 0.02, "bits": 14},
+    "17 bits": _SENSORS,
+    "14 bits": {**_SENSORS, "bits": 14},
     "load": {"load": 0.2},
+    "17 bits, load": {**_SENSORS, "load": 0.2},
 }
 """Noise and offset of the currents in LSB of the converter, Coulomb friction and load as parts of the rated torque."""
 STEP_RPM, LOAD_NM, START_RPM = 150.0, 8.0, 600.0
