@@ -23,7 +23,8 @@ import numpy as np
 from salient.bench.drive import Experiment
 from salient.identify.link import CHARGES, HOLD_RECORD_S, ON, RESTS, IdentifyError, Link
 
-PULSE_LEVEL, PUSH_LEVEL, HOLD_LEVEL, TURNING_LEVEL, PROBE_LEVEL = 4095 / 4096, 0.5, 0.3, 0.25, 0.1
+PULSE_LEVEL, PUSH_LEVEL, HOLD_LEVEL, TURNING_LEVEL, PROBE_LEVEL = 0.98, 0.5, 0.3, 0.25, 0.1
+"""Parts of the current limit; a pulse may exceed its level by a prediction's error, the drive ends all at 3 %."""
 _STILL = 0.003 / (2.0 * math.pi)
 """Rotation below which the rotor has not moved, of a revolution."""
 _QUIET = 0.02
@@ -31,8 +32,8 @@ _QUIET = 0.02
 _HOLD_S, _HOLD_MAX_S, _DAMPED_MAX = 0.15, 3.0, 12
 _FREEWHEEL_MS = 50
 _LATENCY_S = 2.5e-3
-_SLOWEST, _FASTEST = 0.7, 1.2
-"""Parts of the drift speed, between which it is kept."""
+_SLOW, _SLOWEST, _FASTEST = 0.2, 0.7, 1.2
+"""Parts of the drift speed: below the first the rotor stands, between the others it is kept."""
 _PATIENCE_S, _PATIENCE_LOADED_S = 0.05, 0.01
 """Wait for a window that is worth one pulse more of it; also while a load changes the speed."""
 _LOSS_PART, _ENOUGH = 0.65, 0.95
@@ -277,8 +278,8 @@ class Sequence:
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
         at = turn + speed * (_LATENCY_S + duration_s) / 2.0
         phase = max(found.phases, key=lambda each: -direction * math.sin(2.0 * math.pi * found.electrical(each, at)))
-        if found.wired_us:  # from then on the shaft is found by the records
-            self._end_push(phase)
+        if found.wired_us and speed * direction > -0.5 * self._drift:  # the shaft is found by the records; but first
+            self._end_push(phase)  # a rotor that the load turns away has to be caught
         self._pushed = phase
         return self.link.run(Experiment("hold", phase, PUSH_LEVEL), duration_s)
 
@@ -304,11 +305,15 @@ class Sequence:
             if abs(speed) > 0.05 * star and not self._load:
                 direction = 1 if speed > 0 else -1
             drives = self._drives(speed * direction / star)
-            if abs(speed) < 0.2 * star or (drives and (self._load or self._lacks_braking(counts, direction))):
+            slow = abs(speed) < _SLOW * star
+            if drives and self._load or not self._load and (slow or drives and self._lacks_braking(counts, direction)):
                 log = self._push(direction, speed, turn)
                 continue
             self._end_push()
-            window, log = self._measure(counts, star, speed, turn, direction)
+            if self._load:  # up to the drift speed, and down to it the other way, while the load turns the rotor back
+                window, log = self._measure_falling(counts, star, speed, turn)
+            else:
+                window, log = self._measure(counts, star, speed, turn, direction)
             fired = log[log["state"] == CHARGES]
             if len(fired):
                 phase = int(fired["phase"][0])
@@ -340,11 +345,22 @@ class Sequence:
         return window, self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
                                    timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
 
+    def _measure_falling(self, counts: np.ndarray, star: float, speed: float, turn: float) -> tuple[int, np.ndarray]:
+        """As _measure, of a rotor that a load turns back: near standstill at once, of the phase whose present window
+        has had the fewest."""
+        if abs(speed) > _SLOW * star:
+            return self._measure(counts, star, speed, turn, 1 if speed > 0.0 else -1)
+        bins = counts.shape[1]
+        windows = [int(self.found.electrical(phase, turn) * bins) % bins for phase in self.found.phases]
+        row = min(range(len(windows)), key=lambda each: counts[each, windows[each]])
+        return windows[row], self._pulse(Experiment("pulse", self.found.phases[row], PULSE_LEVEL), mapped=True)
+
     def _drives(self, speed: float) -> bool:
         """Whether the next pulse is to drive, by the speed, part of the drift speed: until it is above 1.2 of it, and
-        then not before it is below 0.7 of it."""
-        if speed > _FASTEST or speed < _SLOWEST:
-            self._driving = speed < _SLOWEST
+        then not before it is below 0.7 of it. With a load between 0.7 of it and half of it the other way."""
+        slowest, fastest = (-0.5, _SLOWEST) if self._load else (_SLOWEST, _FASTEST)
+        if speed > fastest or speed < slowest:
+            self._driving = speed < slowest
         return self._driving
 
     @staticmethod
@@ -386,7 +402,7 @@ class Sequence:
                 if sign and (-1 if centre < 0.5 else 1) != sign:
                     continue
                 ahead = (direction * (centre - place)) % 1.0
-                arrival_s = ahead / found.rotor_poles / max(abs(speed), 0.2 * star)
+                arrival_s = ahead / found.rotor_poles / max(abs(speed), _SLOW * star)
                 cost = counts[row, window] + arrival_s / (_PATIENCE_LOADED_S if self._load else _PATIENCE_S)
                 if best is None or cost < best[0]:
                     best = (cost, row, window, arrival_s)
