@@ -219,8 +219,9 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
     /* The request as it was sent: bus-off disarms, and a request to run is published as off. */
     bus->run_inhibited = bus->run_inhibited && command_needs_arming(drive->comms.commands.requested.request);
     if (!bus->run_inhibited) {
-        position_command_t position = drive->control.position_command;
-        if (command->mode == DRIVE_MODE_POSITION) {
+        const bool positions = command->mode == DRIVE_MODE_POSITION;
+        position_command_t position;
+        if (positions) {
             position = position_command(&drive->control_parameters.position, &command->position);
             if (position.set_point.homing >= POSITION_HOMING_METHODS) {
                 position.set_point.homing = (position_homing_t)drive->parameters.values[PARAMETER_HOMING_METHOD];
@@ -228,7 +229,9 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
         }
         hal_critical_enter(hal);
         drive->command = *command;
-        drive->control.position_command = position;
+        if (positions) { /* long: the interrupts of the other modes do not wait for it */
+            drive->control.position_command = position;
+        }
         drive->identify.command = drive->comms.commands.identify;
         hal_critical_leave(hal);
         drive->ramping = false;

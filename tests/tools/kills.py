@@ -90,6 +90,7 @@ KINDS = {
                      "--out {folder}/identified/motor.toml"),
     "parameters": Kind(f"parameters save {{folder}}/saved.toml {_BUS}", bus=True),
     "machine": Kind("machine saturating --out {folder}/machine"),
+    "board": Kind("board build --out {folder}/board"),
     "compare": Kind("compare speeds --quick --samples 1 --resume --out {folder}/compare"),
     "campaign": Kind("campaign --seeds 16 --out {folder}/campaign"),
     "replay": Kind("replay 1 --out {folder}/replay"),
