@@ -24,8 +24,8 @@ BUS = "/tmp/salient.sock"
 FOLDERS = ("firmware", "hal", "emulator", "tools", "tests")
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
              *sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("README.md"))]
-# The suite itself, and every experiment with its report (tests/tools/test_demo.py).
-NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b", re.MULTILINE)
+# The suite itself, and every experiment with its report (tests/tools/test_demo.py) but on a measured motor.
+NOT_TO_BE_RUN = re.compile(r"^tools/salient (test|demo)\b(?!.*--true-machine)", re.MULTILINE)
 
 STARTS_A_DRIVE = re.compile(r"^tools/salient sim\b", re.MULTILINE)
 SELECTIONS = ((re.compile(r"(\bctest [^&|\n]*)"), r"\1 -N | grep 'Total Tests: [1-9]'"),

@@ -306,7 +306,8 @@ class Sequence:
                 direction = 1 if speed > 0 else -1
             drives = self._drives(speed * direction / star)
             slow = abs(speed) < _SLOW * star
-            if drives and self._load or not self._load and (slow or drives and self._lacks_braking(counts, direction)):
+            lacks = slow or (drives and self._lacks_braking(counts, direction))
+            if drives if self._load else lacks:
                 log = self._push(direction, speed, turn)
                 continue
             self._end_push()
