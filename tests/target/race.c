@@ -187,6 +187,16 @@ uint8_t telemetry_sensors_e_f(const drive_t *from) {
     return 0;
 }
 
+/* Nor experiments, which the pattern begins: they would write the duties in the snapshot. */
+void identify_begin(identify_t *identify, uint32_t angle, bool permitted) {
+    (void)identify, (void)angle, (void)permitted;
+}
+
+void identify_step(const identify_parameters_t *parameters, identify_t *identify, const identify_sample_t *sample,
+                   int32_t duty_q15[HAL_PHASES_MAX]) {
+    (void)parameters, (void)identify, (void)sample, (void)duty_q15;
+}
+
 /* No checks of the background: they would read the pattern. */
 thermal_parameters_t thermal_configure(const int32_t *values) {
     (void)values;
