@@ -284,10 +284,10 @@ TIMED_BUILDS = [build for build in TARGET_BUILDS if build.startswith("cortex-m4"
 @pytest.mark.in_turns
 @pytest.mark.parametrize("build", TIMED_BUILDS)
 def test_shared_data_is_torn_without_the_critical_section_and_never_with_it(race, build):
-    """A command is three words stored by one instruction, which QEMU does not interrupt: never torn in either build."""
+    """A command is some instructions' words: a set point of position mode belongs to it."""
     found = race(build, "no_critical_section", timed=True)
     assert found.interrupts > 5000
-    assert found.torn_parameters > 20 and found.torn_commands == 0 and found.torn_snapshots > 0
+    assert found.torn_parameters > 20 and found.torn_commands > 5 and found.torn_snapshots > 0
     found = race(build, "protected", timed=True)
     assert found.interrupts > 5000
     assert found.torn == (0, 0, 0, 0, 0)
@@ -365,7 +365,7 @@ def test_late_deferred_interrupt_is_counted_and_one_that_does_not_end_is_a_fault
     assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == 0
     control_us = processor(bench, "worst_us") - 10
     deferred_us = bench.telemetry["DRIVE_DEFERRED.worst_us"].last - processor(bench, "worst_us")
-    assert 0.5 < deferred_us < 3
+    assert 0.5 < deferred_us < 4
 
     # In each period it has four fifths of the time that it takes: two periods.
     bench = held(make_bench, PERIOD_US - control_us - 0.8 * deferred_us)
