@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_same_bits import load_step_150, start_600
 
-from salient.bench.bench import Bench
 from salient.bench.programs import BOARD_CLOCK_MHZ
 from salient.bus.signals import drive_database
 from salient.config import BOARD_BUILD, CONTROLLERS
@@ -30,17 +30,6 @@ def host_of_the_clock() -> Path:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
     return folder / "bin" / "salient_host"
-
-
-def start_600(bench: Bench) -> None:
-    bench.drive.speed_reference_rpm = 600
-    bench.run_for(0.4)
-
-
-def load_step_150(bench: Bench) -> None:
-    bench.at(0.13).load_torque_Nm = 8
-    bench.drive.speed_reference_rpm = 150
-    bench.run_for(0.5)
 
 
 def after_the_first(frames: list[tuple[int, int, bytes]]) -> list[tuple[int, int, bytes]]:

@@ -184,9 +184,7 @@ class Sequence:
                 level = TURNING_LEVEL  # where even a period at full voltage is too long for the smaller one
         self._order([self._aligned(phase, shown[phase]) for phase in found.phases])
         for phase in found.phases:
-            for part in (0.25, 0.5, 1.0):
-                self._settle_speed()
-                self._freewheel(phase, part)
+            self._resistance(phase)
         self._settle_speed()
         found.wired_us = int(link.log["time_us"][-1])
 
@@ -242,10 +240,9 @@ class Sequence:
 
     def _resistance(self, phase: int) -> None:
         for part in (0.25, 0.5, 1.0):
-            self._freewheel(phase, part)
-
-    def _freewheel(self, phase: int, part: float) -> None:
-        self._pulse(Experiment("freewheel", phase, part * PULSE_LEVEL, _FREEWHEEL_MS))
+            if self._load:
+                self._settle_speed()
+            self._pulse(Experiment("freewheel", phase, part * PULSE_LEVEL, _FREEWHEEL_MS))
 
     # --- map ---------------------------------------------------------------------------------------------------------
 
