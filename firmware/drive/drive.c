@@ -103,13 +103,9 @@ static inline fault_trace_values_t trace_values(const drive_t *drive, const hal_
     };
 }
 
-/* A period of an experiment; false, and nothing is done, outside of that mode. */
-NOINLINE static bool identify(drive_t *drive, hal_t *hal, const hal_adc_sample_t *adc, uint32_t time_us) {
+/* A period of an experiment. */
+NOINLINE static void experiment(drive_t *drive, hal_t *hal, const hal_adc_sample_t *adc, uint32_t time_us) {
     control_state_t *control = &drive->control;
-    if (!control->state_machine.identifies) {
-        drive->identify.begun = false;
-        return false;
-    }
     const control_parameters_t *parameters = &drive->control_parameters;
     const identify_parameters_t identify_parameters = {
         .limit_q9 = parameters->duty.current_limit_q9,
@@ -132,7 +128,6 @@ NOINLINE static bool identify(drive_t *drive, hal_t *hal, const hal_adc_sample_t
     if (drive->identify.records && drive->sampler.event == SAMPLER_EVENT_IDENTIFY) {
         sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
     }
-    return true;
 }
 
 void drive_control_interrupt(drive_t *drive, hal_t *hal) {
@@ -151,7 +146,10 @@ void drive_control_interrupt(drive_t *drive, hal_t *hal) {
         hal_pwm_write(hal, &drive->compare);
         const fault_trace_values_t values = trace_values(drive, &adc);
         fault_trace_run(&drive->trace, &values);
-    } else if (!identify(drive, hal, &adc, sample.time_us)) {
+    } else if (drive->control.state_machine.identifies) {
+        experiment(drive, hal, &adc, sample.time_us);
+    } else {
+        drive->identify.begun = false;
         const fault_trace_values_t values = trace_values(drive, &adc);
         hal_pwm_open_all(hal);
         if (sample.break_causes != 0) {

@@ -24,7 +24,7 @@ from salient.target.static_checks import deepest_stack, size
 FILE = ROOT / "tests" / "target" / "baseline.toml"
 MACHINE = "saturating"
 PAGE = REFERENCE / "cost.md"
-FLASH_MAX_BYTES = 104 * 1024
+FLASH_MAX_BYTES = 112 * 1024
 """Limit of the firmware with the tables of one machine; cmake/check_size.cmake enforces it."""
 RAM_MAX_BYTES = 20 * 1024
 """Limit of variables and stack, with the 2 KiB of the fault trace and without the triggered buffer."""
