@@ -337,6 +337,13 @@ static void limit_currents(const control_parameters_t *parameters, const deferre
     }
 }
 
+/* A step that resets has done enough: the next one counts what the rotor has turned meanwhile. */
+static void follow_position(control_state_t *state, const deferred_input_t *input, bool reset) {
+    if (!reset) {
+        position_control_follow(state, input);
+    }
+}
+
 static pwm_ditc_plan_t plan_duty(const control_parameters_t *parameters, const deferred_input_t *input,
                                  const table_scale_factors_t *scale) {
     const pwm_ditc_plan_sample_t sample = {
@@ -424,7 +431,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         await_slow_counts(parameters, deferred, input, input->periods);
         slow_counts_update(&parameters->slow_counts, &deferred->slow_counts, 0);
         limit_currents(parameters, input, reset, results);
-        position_control_follow(state, input);
+        follow_position(state, input, reset);
     } else if (parameters->torque_law != TORQUE_LAW_PREDICTIVE) {
         if (deferred->slow_counts.slow) {
             learn_between_counts(parameters, deferred, input, state->flux_misalignment);
@@ -434,7 +441,7 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
         }
         await_slow_counts(parameters, deferred, input, input->periods);
         limit_currents(parameters, input, reset, results);
-        position_control_follow(state, input);
+        follow_position(state, input, reset);
     } else if (!reset) { /* a step that resets has done enough */
         take_turn(parameters, state, input);
     }

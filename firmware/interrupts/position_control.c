@@ -37,9 +37,13 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
         fixed_add(results->speed.speed_law_torque_q24, for_inertia_q24(deferred, output.torque_q24));
 }
 
-/* Step of position mode: with its sample, which the other modes need not. */
-NOINLINE static void begin_step(const control_parameters_t *parameters, control_state_t *state,
-                                const deferred_input_t *input, deferred_results_t *results) {
+/* Step of position mode: with its sample, which the other modes need not. False, and nothing is done, while the drive
+ * does not run, and on a machine that runs in one direction only. */
+NOINLINE static bool begin_step(const control_parameters_t *parameters, control_state_t *state,
+                                const deferred_input_t *input, const command_t *command, deferred_results_t *results) {
+    if (!input->run || command->request != COMMAND_RUN || parameters->speed_reference_min_q22 >= 0) {
+        return false;
+    }
     const int32_t limit_q24 =
         fixed_min(fixed_min(torque_limit_q24(parameters, state), state->deferred.conduction.torque_max_q24),
                   -state->deferred.conduction.torque_min_q24);
@@ -54,13 +58,12 @@ NOINLINE static void begin_step(const control_parameters_t *parameters, control_
     position_status_t *status = &state->position.status;
     status->active = status->active && state->deferred.follows_position; /* else it begins */
     control_position(parameters, state, input, &sample, results);
+    return true;
 }
 
 void position_control_deferred(const control_parameters_t *parameters, control_state_t *state,
                                const deferred_input_t *input, const command_t *command, deferred_results_t *results) {
-    if (command->mode == DRIVE_MODE_POSITION && input->run && command->request == COMMAND_RUN &&
-        parameters->speed_reference_min_q22 < 0) {
-        begin_step(parameters, state, input, results);
+    if (command->mode == DRIVE_MODE_POSITION && begin_step(parameters, state, input, command, results)) {
         return;
     }
     state->deferred.follows_position = false;
