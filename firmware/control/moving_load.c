@@ -79,12 +79,13 @@ uint32_t moving_load_rounding_q4(const moving_load_parameters_t *parameters, mov
     const uint32_t distance_q15 = fixed_magnitude((int32_t)(q * step_q32)) >> 17; /* at most 2^14 */
     const uint32_t quarters = (distance_q15 * parameters->time_constant) >> 13;   /* of the beats; below 2^12 */
     const uint32_t divisor = q * (quarters + 1);
-    /* None is 0, which only memory that has changed has: it counts as the largest one. */
-    const uint32_t least = q == 1 || divisor - 1u < rounding->least - 1u ? divisor : rounding->least;
+    /* None is 0, which counts as the largest one. */
+    const uint32_t least = divisor - 1u < rounding->least - 1u ? divisor : rounding->least;
     rounding->least = least;
     rounding->q = q;
     if (q == ROUNDING_RATIOS) {
         rounding->q = 0;
+        rounding->least = 0;
         rounding->rounding_q4 = (8u << parameters->encoder_shift) / least;
     }
     return rounding->rounding_q4;

@@ -237,7 +237,8 @@ static bool at_torque_limit(const deferred_t *deferred, int32_t torque_q24) {
 }
 
 /* From a change of the speed reference on it is approached, until two windows of inertia.h and SETTLING_UPDATES after
- * the speed was first within a sixteenth of it with a torque below its limit: what comes later may be a load's. */
+ * the speed was first within a sixteenth of it with a torque below its limit: what comes later may be a load's. A
+ * position reference is approached all the time. */
 static void approach_reference(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input) {
     const uint32_t settling = (2u << parameters->inertia.window_shift) + SETTLING_UPDATES;
@@ -251,7 +252,7 @@ static void approach_reference(const control_parameters_t *parameters, deferred_
     }
     deferred->updates_since_near +=
         deferred->updates_since_near > 0 ? deferred->updates_since_near < settling : is_near && !limited;
-    deferred->approaches_reference = deferred->updates_since_near < settling;
+    deferred->approaches_reference = deferred->follows_position || deferred->updates_since_near < settling;
 }
 
 _Static_assert(DEFERRED_COMMON_PERIODS / DEFERRED_LEARNING_PERIODS == 4, "four samples in the mean torque");
@@ -268,7 +269,7 @@ static void identify_inertia(const control_parameters_t *parameters, deferred_t 
     inertia_step(
         &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, deferred->mean_torque_q24,
         deferred->follows_position ? deferred->accelerates : at_torque_limit(deferred, input->torque_reference_q24),
-        deferred->follows_position || deferred->approaches_reference);
+        deferred->approaches_reference);
     deferred->mean_torque_q24 = 0;
 }
 
@@ -375,20 +376,16 @@ NOINLINE static void take_turn(const control_parameters_t *parameters, control_s
     deferred_t *deferred = &state->deferred;
     const int32_t *flux_misalignment = state->flux_misalignment;
     deferred->turn = (deferred->turn + 1) % DEFERRED_COMMON_PERIODS;
-    switch (turns[deferred->turn]) {
-    case TURN_LOAD:
+    const deferred_turn_t turn = turns[deferred->turn];
+    if (turn == TURN_INERTIA) { /* the longest one is asked for first */
+        run_jobs(TURN_INERTIA, parameters, deferred, input, flux_misalignment);
+    } else if (turn == TURN_COMMON) {
+        run_jobs(TURN_COMMON, parameters, deferred, input, flux_misalignment);
+    } else if (turn == TURN_PHASE) {
+        run_jobs(TURN_PHASE, parameters, deferred, input, flux_misalignment);
+    } else {
         run_jobs(TURN_LOAD, parameters, deferred, input, flux_misalignment);
         position_control_follow(state, input);
-        break;
-    case TURN_PHASE:
-        run_jobs(TURN_PHASE, parameters, deferred, input, flux_misalignment);
-        break;
-    case TURN_COMMON:
-        run_jobs(TURN_COMMON, parameters, deferred, input, flux_misalignment);
-        break;
-    default:
-        run_jobs(TURN_INERTIA, parameters, deferred, input, flux_misalignment);
-        break;
     }
 }
 

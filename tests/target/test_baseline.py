@@ -37,9 +37,7 @@ RAM_TOLERANCE_BYTES = 32
 COUNT_TOLERANCE = 0.01
 BOUND_LIMITS = {"traditional": 730, "paper": 1260, "salient": 2080, "salient_four_phases": 2500}
 """Instructions of the control interrupt on the Cortex-M4."""
-POSITION = 24
-"""Instructions by which the modes that are no position mode exceed the budgets, because the position is followed."""
-BOTH_BOUND_LIMITS = {"salient": 2950 + POSITION, "salient_four_phases": 3350 + POSITION}
+BOTH_BOUND_LIMITS = {"salient": 2950, "salient_four_phases": 3350}
 """Instructions of both interrupts together."""
 
 measure_once = lru_cache(measure)
