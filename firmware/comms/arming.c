@@ -14,8 +14,7 @@ void arming_init(arming_t *arming) {
 #define CHECK_ARMED 0x00ffu
 #define CHECK_CONFIGURING 0xff00u
 
-/* Both are what they were set to. */
-static bool is_intact(const arming_t *arming) {
+COLD bool arming_is_intact(const arming_t *arming) {
     return arming->check == ((arming->armed ? CHECK_ARMED : 0u) | (arming->configuring ? CHECK_CONFIGURING : 0u));
 }
 
@@ -26,7 +25,7 @@ static void end_attempt(arming_t *arming) {
 }
 
 COLD void arming_check_timeout(arming_t *arming, uint32_t time_us) {
-    if (!is_intact(arming)) {
+    if (!arming_is_intact(arming)) {
         arming_disarm(arming);
         arming_end_configuration(arming);
     }

@@ -52,6 +52,9 @@ typedef enum { ARMING_REFUSED, ARMING_CHALLENGED, ARMING_ARMED, ARMING_CONFIGURI
 /* Not armed, which is to be reported. */
 void arming_init(arming_t *arming);
 
+/* False when one of both armings has changed in memory. [background] */
+bool arming_is_intact(const arming_t *arming);
+
 /* Ends an attempt whose response is overdue, and a configuration without frames; and both armings when one of them has
  * changed in memory. Call it before a frame is received, and at least once in 35 minutes. [background] */
 void arming_check_timeout(arming_t *arming, uint32_t time_us);

@@ -206,15 +206,20 @@ COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
     }
 }
 
-/* False when a run goes on, or is about to begin, by a command that the bus has not brought: one of both copies has
- * changed. The last one before a bus-off is not taken, and lets the one before age. */
+/* False when the request in effect is not the one that the bus has brought: one of both copies has changed. The last one
+ * before a bus-off is not taken, and lets the one before age; the ramp of overdue commands runs after a stop, too. */
 COLD static bool is_commanded(const drive_t *drive) {
     const command_request_t received = drive->comms.command.request;
-    if (drive->command.request == COMMAND_IDENTIFY) {
-        return received == COMMAND_IDENTIFY || drive->comms.bus.run_inhibited;
-    }
-    return drive->command.request != COMMAND_RUN || received == COMMAND_RUN || received == COMMAND_STOP ||
-           drive->comms.bus.run_inhibited;
+    return drive->command.request == received || drive->comms.bus.run_inhibited ||
+           (drive->ramping && drive->command.request == COMMAND_RUN && received == COMMAND_STOP);
+}
+
+/* False when the arming has changed, or what decides how long it lasts: an armed drive has had its last command no
+ * earlier than the last frame of its sender. */
+COLD static bool is_arming_intact(const drive_t *drive, uint32_t time_us) {
+    const commands_t *commands = &drive->comms.commands;
+    const bool in_order = time_us - commands->last_received_us <= time_us - drive->comms.command.time_us;
+    return arming_is_intact(&commands->arming) && (in_order || commands->arming.armed == 0);
 }
 
 /* False when one of both notes of the lost phase has changed. */
@@ -230,7 +235,8 @@ COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
     state_machine_t *state_machine = &drive->control.state_machine;
     self_test_step(test, hal, &drive->control_parameters, &drive->parameters, time_us);
     hal_critical_enter(hal);
-    if (!self_test_latch_intact(&drive->control) || !is_commanded(drive) || !is_lost_phase_intact(drive)) {
+    if (!self_test_latch_intact(&drive->control) || !is_commanded(drive) || !is_arming_intact(drive, time_us) ||
+        !is_lost_phase_intact(drive)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
         drive->control.torque_reference_q24 = 0;
         control_prepare(&drive->control_parameters, &drive->control);

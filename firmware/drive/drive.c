@@ -198,14 +198,20 @@ void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
     deferred_complete(&control->deferred_request, &control->deferred.response);
 }
 
+/* Both copies: background_checks.c compares them. */
+COLD static void withdraw_command(drive_t *drive, hal_t *hal) {
+    hal_critical_enter(hal);
+    drive->command.request = COMMAND_OFF;
+    hal_critical_leave(hal);
+    drive->comms.command.request = COMMAND_OFF;
+}
+
 /* Withdraws a command to run that must not start a run later: without being armed. Silence disarms, so that none
  * becomes so old that the clock wraps and its age appears small again. */
 static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
     if (command_needs_arming(drive->command.request) && !drive->comms.commands.arming.armed &&
         drive->control.state_machine.state != DRIVE_STATE_RUN) {
-        hal_critical_enter(hal);
-        drive->command.request = COMMAND_OFF;
-        hal_critical_leave(hal);
+        withdraw_command(drive, hal);
     }
 }
 
@@ -264,12 +270,6 @@ COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
     return drive->ramp_of_speed && beyond_q22 > fixed_abs(reference_q22) / 16;
 }
 
-COLD static void end_experiments(drive_t *drive, hal_t *hal) {
-    hal_critical_enter(hal);
-    drive->command.request = COMMAND_OFF;
-    hal_critical_leave(hal);
-}
-
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
  * with the time of the last valid command, so that the interrupts need nothing for it. */
 static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
@@ -279,7 +279,7 @@ static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
         return;
     }
     if (drive->command.request == COMMAND_IDENTIFY) { /* experiments have no torque to ramp */
-        end_experiments(drive, hal);
+        withdraw_command(drive, hal);
         return;
     }
     if (drive->ramping && time_us - drive->ramp_us < DRIVE_RAMP_STEP_US) {
@@ -378,7 +378,7 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
         take_command(drive, hal);
     }
     if (drive->identify.state == IDENTIFY_ENDED && drive->command.request == COMMAND_IDENTIFY) {
-        end_experiments(drive, hal);
+        withdraw_command(drive, hal);
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     if (drive->sampler.event == SAMPLER_EVENT_BACKGROUND) {

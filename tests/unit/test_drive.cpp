@@ -694,6 +694,35 @@ TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     EXPECT_TRUE(hal.open);
 }
 
+TEST_F(Drive, a_bit_of_a_run_s_request_or_arming_that_flips_does_not_end_the_run_without_a_fault) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const drive_t before = drive;
+    const hal_t board = hal;
+    const struct {
+        const char *name;
+        size_t at, bytes;
+    } members[] = {INDEX(command.request), INDEX(comms.command.request), INDEX(comms.commands.arming.armed),
+                   INDEX(comms.commands.arming.check), INDEX(comms.commands.last_received_us)};
+    unsigned faults = 0;
+    for (const auto &member : members) {
+        for (size_t bit = 0; bit < 8 * member.bytes; bit++) {
+            uint8_t *bytes = reinterpret_cast<uint8_t *>(&drive) + member.at;
+            bytes[bit / 8] = uint8_t(bytes[bit / 8] ^ 1u << bit % 8);
+            periods(40);
+            const bool runs = drive.control.state_machine.state == DRIVE_STATE_RUN;
+            EXPECT_NE(runs, drive.control.state_machine.record.fault == FAULT_MEMORY) << member.name << ' ' << bit;
+            EXPECT_TRUE(runs || hal.open) << member.name << ' ' << bit;
+            faults += !runs;
+            drive = before;
+            hal = board;
+        }
+    }
+    EXPECT_GT(faults, 32u + 32u + 1u + 16u) << "requests, armed, check, and times that are not in order";
+}
+
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);
     command(COMMAND_RUN);
