@@ -67,7 +67,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
         (["run"], ["SCENARIO.toml"]),
         (["run", "nonesuch.toml"], ["nonesuch.toml", "no such file"]),
         (["sweep", "start_6000"], ["scenario 'start_6000': no such file, and no bundled scenario of that name; ",
-                                   "must be one of load_step_150, start_600"]),
+                                   "must be one of load_step_150, move_90, start_600"]),
         (["log", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
         (["log", "--out", "can.xyz"], ["can.xyz", ".blf"]),
         (["monitor", "--can", "unix:/no/such/bus"], ["unix:/no/such/bus"]),
