@@ -38,10 +38,11 @@ function(salient_install)
     install(EXPORT salient NAMESPACE salient:: FILE salientTargets.cmake DESTINATION ${config})
     foreach(folder hal firmware emulator)
         install(DIRECTORY ${PROJECT_SOURCE_DIR}/${folder}/ DESTINATION ${headers}/${folder} FILES_MATCHING PATTERN "*.h"
-                PATTERN "*.def" PATTERN "qemu" EXCLUDE PATTERN "fmi" EXCLUDE)
+                PATTERN "*.def" PATTERN "qemu" EXCLUDE PATTERN "stm32g4" EXCLUDE PATTERN "skeleton" EXCLUDE
+                PATTERN "fmi" EXCLUDE)
     endforeach()
-    install(DIRECTORY ${PROJECT_BINARY_DIR}/firmware/codec/ ${PROJECT_BINARY_DIR}/emulator/codec/
-                      ${PROJECT_BINARY_DIR}/emulator/host/generated/
+    install(DIRECTORY ${PROJECT_BINARY_DIR}/firmware/codec/ ${PROJECT_BINARY_DIR}/firmware/dictionary/
+                      ${PROJECT_BINARY_DIR}/emulator/codec/ ${PROJECT_BINARY_DIR}/emulator/host/generated/
             DESTINATION ${headers}/generated FILES_MATCHING PATTERN "*.h")
     install(FILES ${PROJECT_SOURCE_DIR}/emulator/host/main.c ${PROJECT_SOURCE_DIR}/emulator/host/host_drive.c
             DESTINATION ${config})
