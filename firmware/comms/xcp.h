@@ -23,8 +23,9 @@
  *
  * Measuring: one DAQ list, of a choice of four events, of at most SAMPLER_CHANNELS_MAX entries within single words.
  * Records that the bus does not take are lost, and counted (drive_t.sampler.lost); the time in the first frame of a
- * record shows them. DAQ frames have the lowest priority of the drive but for two, and only one of them is in a
- * mailbox.
+ * record shows them. The event EV_DAQ_OVERLOAD tells that records were lost: the first time at once, then at most once
+ * in XCP_OVERLOAD_RECORDS records that are sent, and it is counted (drive_t.comms.xcp.daq.overloads). DAQ frames have
+ * the lowest priority of the drive but for two, and only one of them is in a mailbox.
  */
 #ifndef COMMS_XCP_H
 #define COMMS_XCP_H
@@ -42,6 +43,7 @@
 #define XCP_ODTS_MAX SAMPLER_CHANNELS_MAX
 #define XCP_EVENTS 4u /* of sampler_event_t */
 #define XCP_TEXT_BYTES 32u
+#define XCP_OVERLOAD_RECORDS 64u
 
 #define XCP_AREA 0xF0000000u /* bits of an address that select the area */
 #define XCP_AREA_MEMORY 0x00000000u
@@ -88,6 +90,8 @@ typedef struct {
     uint8_t event;                /* sampler_event_t - 1 */
     uint8_t divider;
     bool timestamps, selected, running;
+    uint32_t told_lost, told_taken;             /* sampler_t's counters at the last event of an overload */
+    uint32_t overloads;                         /* such events since the start */
     uint8_t next_odt;                           /* of `record`; at `odts` there is none left */
     uint32_t record[1u + SAMPLER_CHANNELS_MAX]; /* of which the frames are sent */
 } xcp_daq_t;

@@ -6,9 +6,11 @@ enum { WORD_BYTES = 4, MODE_TIMESTAMP = 0x10, MODE_SELECTED = 0x01, MODE_RUNNING
 enum { STOP, START, SELECT };                     /* of a list */
 enum { STOP_ALL, START_SELECTED, STOP_SELECTED }; /* of all lists */
 enum { FIRST_BYTES = 7, TIMESTAMP_BYTES = 2 };
+enum { EVENT = 0xFD, EVENT_DAQ_OVERLOAD = 0x06 };
 
-/* Dynamic configuration, prescaler, timestamps; identification by an absolute number, of 256 in one list. */
-#define DAQ_PROPERTIES 0x13u
+/* Dynamic configuration, prescaler, timestamps, event of an overload; identification by an absolute number, of 256 in
+ * one list. */
+#define DAQ_PROPERTIES 0x93u
 /* Size 2, unit 1 us, one tick is one unit. */
 #define TIMESTAMP_MODE (TIMESTAMP_BYTES | 3u << 4)
 #define EVENT_PROPERTIES 0x04u /* of DAQ */
@@ -135,10 +137,13 @@ static xcp_error_t start(xcp_t *xcp) {
     for (unsigned i = 0; i < daq->entries; i++) {
         setup.word[i] = daq->entry[i].word;
     }
-    if (!sampler_arm(xcp->sampler, &setup, true, xcp->words)) {
+    if (!sampler_arm(xcp->sampler, &setup, true, xcp->memory, xcp->words)) {
         return XCP_ERROR_DAQ_CONFIGURATION;
     }
     daq->next_odt = daq->odts;
+    daq->told_lost = 0;
+    daq->told_taken = 0u - XCP_OVERLOAD_RECORDS;
+    daq->overloads = 0;
     daq->running = true;
     return XCP_ERROR_NONE;
 }
@@ -276,9 +281,28 @@ xcp_error_t xcp_daq_command(xcp_t *xcp, const uint8_t *command, uint8_t *respons
     return set_up(xcp, command);
 }
 
+/* Between two records; the first overload at once. */
+static bool tells_overload(xcp_t *xcp, hal_can_frame_t *frame) {
+    xcp_daq_t *daq = &xcp->daq;
+    const uint32_t lost = *(const volatile uint32_t *)&xcp->sampler->lost;
+    if (lost == daq->told_lost || xcp->sampler->taken - daq->told_taken < XCP_OVERLOAD_RECORDS) {
+        return false;
+    }
+    daq->told_lost = lost;
+    daq->told_taken = xcp->sampler->taken;
+    daq->overloads++;
+    frame->data[0] = EVENT;
+    frame->data[1] = EVENT_DAQ_OVERLOAD;
+    frame->length = 2;
+    return true;
+}
+
 bool xcp_daq_next_frame(xcp_t *xcp, hal_can_frame_t *frame) {
     xcp_daq_t *daq = &xcp->daq;
     if (daq->next_odt >= daq->odts) {
+        if (tells_overload(xcp, frame)) {
+            return true;
+        }
         if (!sampler_take(xcp->sampler, daq->record)) {
             return false;
         }

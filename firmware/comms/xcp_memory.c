@@ -124,7 +124,7 @@ static xcp_error_t command_scope(xcp_t *xcp, uint32_t command) {
         sampler_stop(xcp->sampler);
     } else if (command == SCOPE_TRIGGER) {
         sampler_trigger(xcp->sampler);
-    } else if (!setup_of(xcp, &setup) || !sampler_arm(xcp->sampler, &setup, false, xcp->words)) {
+    } else if (!setup_of(xcp, &setup) || !sampler_arm(xcp->sampler, &setup, false, xcp->memory, xcp->words)) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
     return XCP_ERROR_NONE;

@@ -126,7 +126,7 @@ NOINLINE static void experiment(drive_t *drive, hal_t *hal, const hal_adc_sample
     const fault_trace_values_t values = trace_values(drive, adc);
     fault_trace_run(&drive->trace, &values);
     if (drive->identify.records && drive->sampler.event == SAMPLER_EVENT_IDENTIFY) {
-        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us, 0);
     }
 }
 
@@ -163,8 +163,7 @@ void drive_control_interrupt(drive_t *drive, hal_t *hal) {
         hal_interrupt_request_deferred(hal);
     }
     if ((drive->sampler.event & SAMPLER_IN_CONTROL) != 0) {
-        sampler_record_control(&drive->sampler, drive, DRIVE_WORDS, sample.time_us,
-                               drive->control.deferred.response.completed);
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, sample.time_us, drive->control.deferred_request.skipped);
     }
     drive->used_ticks = hal_interrupt_elapsed_ticks(hal);
     if (drive->used_ticks > drive->worst_ticks) {
@@ -382,7 +381,7 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);
     if (drive->sampler.event == SAMPLER_EVENT_BACKGROUND) {
-        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us);
+        sampler_record(&drive->sampler, drive, DRIVE_WORDS, time_us, 0);
     }
     ramp_down(drive, hal, time_us);
     drop_unarmed_command(drive, hal);

@@ -87,6 +87,7 @@ typedef struct {
 
 static_assert(sizeof(drive_t) % sizeof(uint32_t) == 0, "the sampler and XCP read words");
 #define DRIVE_WORDS (sizeof(drive_t) / sizeof(uint32_t))
+static_assert(DRIVE_WORDS <= SAMPLER_DRIVE_WORDS_MAX, "places of words in it");
 
 /* Prepares the drive and starts the timer. Returns false, and starts nothing, for a node number above NODE_MAX and
  * for a control rate that the timer's clock (hal_pwm.h) cannot make or that is too low for the machine

@@ -7,6 +7,16 @@
  * lost and counted.
  *
  * A word that another context writes is read whole; two words of one variable may be of two steps.
+ *
+ * Arming prepares what an event does, for an event is in an interrupt:
+ * - A word of the drive is kept as a part of the drive, in 2^-32: the high half of the product with the number of words
+ *   is its place, and whatever the part has become in memory, the place is within the drive.
+ * - Every condition is one window. The variable, shifted by a multiplication to the upper end of a word, lies in a
+ * range of the words that may go beyond the largest one to the smallest; those of the lower variables of its word count
+ * to the variable's step. A change is every value but the one at the arming. An edge waits until the variable is
+ * outside.
+ * - A record begins before SAMPLER_WORDS, and the ring is longer by the rest of one. The one test that begins at 0
+ * again bounds a place that has changed in memory, too.
  */
 #ifndef INTERRUPTS_SAMPLER_H
 #define INTERRUPTS_SAMPLER_H
@@ -17,6 +27,7 @@
 #include "fixed/compiler.h"
 
 #define SAMPLER_CHANNELS_MAX 8u
+#define SAMPLER_DRIVE_WORDS_MAX 65536u
 
 /* The drive as words, whatever they belong to, each of which an interrupt may write meanwhile. */
 typedef const volatile uint32_t MAY_ALIAS sampler_word_t;
@@ -45,15 +56,14 @@ typedef enum {
     SAMPLER_RISING,   /* value >= level, and below it at the event before */
     SAMPLER_FALLING,  /* value <= level, and above it at the event before */
     SAMPLER_EQUAL,
-    SAMPLER_CHANGED, /* another value than at the event before */
+    SAMPLER_CHANGED, /* another value than at the arming */
     SAMPLER_CONDITIONS
 } sampler_condition_t;
 
 typedef enum {
     SAMPLER_OFF,
     SAMPLER_STREAMS,
-    SAMPLER_WAITS,    /* for the trigger */
-    SAMPLER_FOLLOWS,  /* records what follows the trigger */
+    SAMPLER_ARMED,    /* a buffer that waits for the trigger, or records what follows it */
     SAMPLER_COMPLETE, /* the ring is to be read */
 } sampler_state_t;
 
@@ -77,33 +87,42 @@ typedef struct {
     int32_t level; /* signed or not as the variable is */
 } sampler_setup_t;
 
+/* Members that an event reads or writes together are neighbours: one instruction for two. */
 typedef struct {
     uint32_t event; /* at which it records, sampler_event_t; 0: none. Written last when it is armed */
-    uint32_t step;  /* deferred step that was recorded last */
     sampler_state_t state;
-    sampler_setup_t setup;
-    uint32_t record_words;   /* the channels; before them in a stream the time, us */
-    uint32_t capacity;       /* of the ring, records */
-    uint32_t place;          /* of the next record in the ring, words; of a complete buffer the place of the oldest */
-    uint32_t missing;        /* records by which fewer than `before` precede the trigger */
-    uint32_t following;      /* records from the trigger on that are still to be written */
-    uint32_t countdown;      /* events to the next record */
-    uint32_t trigger_events; /* events from the trigger to record number `before` - `missing`, from the oldest on */
+    uint32_t room;          /* records in the ring of a stream; 0: a buffer */
+    uint32_t waiting_floor; /* while it waits for the trigger: the least of `left`; then 0 */
+    uint32_t left;          /* records from the next one on, if the trigger comes now or has come */
+    uint32_t countdown;     /* events to the next record */
+    uint32_t divider;
+    uint32_t place;        /* of the next record, words; of a complete buffer the oldest; from SAMPLER_WORDS on 0 */
+    uint32_t record_words; /* the channels; before them in a stream the time, us */
+    uint32_t last_channel; /* 0..SAMPLER_CHANNELS_MAX - 1 */
+    uint32_t capacity;     /* of the ring, records */
+    /* The trigger's variable: */
+    uint32_t trigger_part; /* as `part` */
+    uint32_t factor;       /* that shifts it to the upper end of a word */
+    uint32_t window_end;   /* the last value of the condition */
+    uint32_t window_length;
+    uint32_t waits_for_outside; /* of an edge: 1 until it was outside */
+    /* When the trigger came: */
+    uint32_t trigger_events;             /* events to the next record */
+    uint32_t trigger_left;               /* `left`: the others of the ring precede it */
+    uint32_t part[SAMPLER_CHANNELS_MAX]; /* the words of the drive, in 2^-32 of it */
     uint32_t written, taken; /* records of a stream, modulo 2^32; the second one is written by the background */
     uint32_t taken_place;
     uint32_t lost; /* records of a stream */
-    int32_t last;  /* value of the variable at the event before; unsigned less 2^31 */
-    bool has_last;
-    uint32_t ring[SAMPLER_WORDS > 0u ? SAMPLER_WORDS : 1u];
+    uint32_t ring[SAMPLER_WORDS > 0u ? SAMPLER_WORDS + SAMPLER_CHANNELS_MAX : 1u];
 } sampler_t;
 
 /* Stops recording; the ring stays as it is. [background] */
 void sampler_stop(sampler_t *sampler);
 
 /* Records from the next event on. streams: as a stream; else as a triggered buffer. False, with nothing changed, when a
- * member of the set-up is out of its range or the ring has fewer than two records more than `before`. words: of the
- * drive. [background] */
-bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool streams, uint32_t words);
+ * member of the set-up is out of its range, the variable cannot have the level, or the ring has fewer than two records
+ * more than `before`. memory: the drive, of `words` words, at most SAMPLER_DRIVE_WORDS_MAX. [background] */
+bool sampler_arm(sampler_t *sampler, const sampler_setup_t *setup, bool streams, const void *memory, uint32_t words);
 
 /* Triggers now, whatever the condition; no effect unless it waits. [background] */
 void sampler_trigger(sampler_t *sampler);
@@ -112,12 +131,9 @@ void sampler_trigger(sampler_t *sampler);
  * [background] */
 bool sampler_take(sampler_t *sampler, uint32_t record[1 + SAMPLER_CHANNELS_MAX]);
 
-/* An event for which sampler->event is set. memory: the drive, of `words` words. [context of the event] */
-void sampler_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us);
-
-/* A control interrupt at the end of which sampler->event has SAMPLER_IN_CONTROL. deferred_steps: number of complete
- * ones. [control interrupt] */
-void sampler_record_control(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us,
-                            uint32_t deferred_steps);
+/* An event for which sampler->event is set; the control interrupt's is one that has SAMPLER_IN_CONTROL. memory: the
+ * drive, of `words` words. skipped, of a control interrupt: periods since one found a deferred step complete. [context
+ * of the event] */
+void sampler_record(sampler_t *sampler, const void *memory, uint32_t words, uint32_t time_us, uint32_t skipped);
 
 #endif

@@ -19,6 +19,7 @@ from salient.machine.parameter_table import CHOICES, read_table
 pyxcp_types = pytest.importorskip("pyxcp.types")
 pya2l = pytest.importorskip("pya2l")
 
+EVENT = 0xFD
 ERRORS = {"locked": 0x25, "protected": 0x23, "range": 0x22}
 
 
@@ -127,9 +128,17 @@ def test_eight_signals_at_10_kHz_fill_the_bus_and_what_is_lost_is_counted_on_bot
              "dc_link_voltage_V"]
     duration_s = 0.8
     with connected(bench) as master:
+        handled = []
+        handle = master.transport.process_event_packet
+        master.transport.process_event_packet = lambda packet: handled.append(bytes(packet)) or handle(packet)
         records = measured(bench, master, names, 4, duration_s)
-        lost, written = (int.from_bytes(bytes(master.shortUpload(4, Layout(layout_file()).bits(name).start // 8)),
-                                        "little") for name in ("sampler.lost", "sampler.written"))
+        lost, written, overloads = (
+            int.from_bytes(bytes(master.shortUpload(4, Layout(layout_file()).bits(name).start // 8)), "little")
+            for name in ("sampler.lost", "sampler.written", "comms.xcp.daq.overloads"))
+    events = [bytes(frame.data) for _, frame in bench.log
+              if frame.arbitration_id == RESPONSE_ID and frame.data[0] == EVENT]
+    assert set(events) == {bytes([EVENT, pyxcp_types.Event.EV_DAQ_OVERLOAD])}
+    assert len(handled) == len(events) == overloads and len(records) // 64 - 1 <= overloads <= len(records) // 64 + 1
     gaps = np.diff([time_us for time_us, _ in records]) % 65_536
     assert np.all(gaps % 100 == 0)
     assert lost + written == pytest.approx(10_000 * duration_s, abs=20)

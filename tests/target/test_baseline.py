@@ -26,7 +26,7 @@ from salient.target.baseline import (
     tables_of,
     with_table,
 )
-from salient.target.bound_report import bounds
+from salient.target.bound_report import armed_bound, bounds
 from salient.target.isr_profile import IsrProfile, measure
 from salient.target.trace import Trace
 
@@ -39,6 +39,8 @@ BOUND_LIMITS = {"traditional": 730, "paper": 1260, "salient": 2080, "salient_fou
 """Instructions of the control interrupt on the Cortex-M4."""
 BOTH_BOUND_LIMITS = {"salient": 2950, "salient_four_phases": 3350}
 """Instructions of both interrupts together."""
+ARMED_PERCENT = 3
+"""Instructions by which an armed triggered buffer may exceed the budget of both interrupts."""
 
 measure_once = lru_cache(measure)
 
@@ -97,6 +99,12 @@ def test_computed_bounds_on_the_cortex_m4_are_within_their_limits():
         assert 0.5 * limit < found["interrupt"][variant] <= limit, variant
     for variant, limit in BOTH_BOUND_LIMITS.items():
         assert 0.5 * limit < found["interrupt"][variant] + found["deferred"][variant] <= limit, variant
+
+
+@pytest.mark.parametrize("variant", long_run.VARIANTS)
+def test_armed_buffer_takes_at_most_3_percent_of_the_budget(variant):
+    more = armed_bound(variant, "cortex-m4") - bounds("cortex-m4")["interrupt"][variant]
+    assert 40 < more <= ARMED_PERCENT * 2950 // 100
 
 
 @pytest.mark.parametrize("variant", long_run.VARIANTS)

@@ -472,12 +472,13 @@ TEST_F(Xcp, the_area_of_the_buffer_arms_triggers_and_stops_it) {
     }
     EXPECT_EQ(write(XCP_AREA_SCOPE, 3), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(write(XCP_AREA_SCOPE, 1), DONE);
-    const sampler_setup_t &armed = drive->sampler.setup;
-    EXPECT_EQ(drive->sampler.state, SAMPLER_WAITS);
-    EXPECT_EQ(drive->sampler.event, uint32_t(SAMPLER_EVENT_BACKGROUND));
-    EXPECT_TRUE(armed.divider == 2 && armed.before == 100 && armed.condition == SAMPLER_EQUAL && armed.level == -1);
-    EXPECT_TRUE(armed.variable.word == 10 && armed.variable.left == 16 && armed.variable.right == 24);
-    EXPECT_TRUE(armed.variable.is_signed && armed.channels == 2 && armed.word[0] == 2 && armed.word[1] == 3);
+    const sampler_t &armed = drive->sampler;
+    EXPECT_EQ(armed.state, SAMPLER_ARMED);
+    EXPECT_EQ(armed.event, uint32_t(SAMPLER_EVENT_BACKGROUND));
+    EXPECT_TRUE(armed.divider == 2 && armed.capacity - armed.waiting_floor == 100 && armed.record_words == 2);
+    EXPECT_TRUE(armed.factor == 1u << 16 && armed.window_end == 0xFFFFFFFFu && armed.window_length == 0xFFFFFFu);
+    const auto word_of = [](uint32_t part) { return uint64_t(part) * DRIVE_WORDS >> 32; };
+    EXPECT_TRUE(word_of(armed.trigger_part) == 10 && word_of(armed.part[0]) == 2 && word_of(armed.part[1]) == 3);
     EXPECT_EQ(write(XCP_AREA_SCOPE, 2), DONE);
     while (drive->sampler.event != 0) {
         event(SAMPLER_EVENT_BACKGROUND);

@@ -143,7 +143,7 @@ struct World {
     void step() {
         bus.step(time_us, STEPS_OF_FRAME);
         if ((drive->sampler.event & SAMPLER_IN_CONTROL) != 0) {
-            sampler_record_control(&drive->sampler, drive.get(), DRIVE_WORDS, time_us, 0);
+            sampler_record(&drive->sampler, drive.get(), DRIVE_WORDS, time_us, 0);
         }
         if (comms_telemetry_due(&comms, time_us)) {
             bus_monitor_step(&comms.bus, &bus, time_us);

@@ -68,7 +68,8 @@ class XcpDaq : public XcpBench {
 };
 
 TEST_F(XcpDaq, describes_what_there_is) {
-    EXPECT_EQ(send({0xDA}), (bytes_t{0xFF, 0x13, 1, 0, XCP_EVENTS, 0, 0, 0})) << "dynamic, prescaler, timestamps";
+    EXPECT_EQ(send({0xDA}), (bytes_t{0xFF, 0x93, 1, 0, XCP_EVENTS, 0, 0, 0}))
+        << "dynamic, prescaler, timestamps, event";
     EXPECT_EQ(send({0xD9}), (bytes_t{0xFF, 1, 4, 1, 0, 0x32, 1, 0})) << "two bytes of 1 us";
     EXPECT_EQ(send({0xD8, 0, 0, 0}), (bytes_t{0xFF, 0x04, 8, 8, 0, 0}));
     EXPECT_EQ(send({0xD8, 0, 1, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
@@ -302,7 +303,8 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
         ASSERT_EQ(start_stop(1), (bytes_t{0xFF, 0}));
         std::vector<std::vector<bytes_t>> expected;      // frames of each record
         const uint32_t loss = seed % 30 == 0 ? 6000 : 0; // events before the first frame is sent
-        size_t record = 0, odt = 0;
+        size_t record = 0, odt = 0, told_record = 0;
+        uint32_t overloads = 0, told_lost = 0;
         for (uint32_t k = 0; k < 600 + loss; k++) {
             time_us += random() % 100;
             for (unsigned i = 0; i < 4 * WORDS; i++) {
@@ -329,7 +331,16 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
                 }
             }
             for (unsigned sent = k < loss ? 0 : unsigned(random() % 5); sent > 0; sent--) {
+                const bool tells = odt == 0 && drive->sampler.lost != told_lost &&
+                                   (overloads == 0 || record - told_record >= XCP_OVERLOAD_RECORDS);
                 const bytes_t frame = next_frame();
+                if (tells) {
+                    ASSERT_EQ(frame, (bytes_t{0xFD, 0x06})) << "seed " << seed;
+                    overloads++;
+                    told_lost = drive->sampler.lost;
+                    told_record = record;
+                    continue;
+                }
                 ASSERT_EQ(frame, record < expected.size() ? expected[record][odt] : bytes_t{}) << "seed " << seed;
                 odt += !frame.empty();
                 record += odt == odts.size();
@@ -339,6 +350,8 @@ TEST_F(XcpDaq, frames_are_the_bytes_of_the_records_at_every_divider_in_order) {
         }
         ASSERT_EQ(drive->sampler.written, expected.size());
         ASSERT_EQ(expected.size() + drive->sampler.lost, (600 + loss + divider - 1) / divider);
+        ASSERT_EQ(xcp.daq.overloads, overloads);
+        ASSERT_EQ(overloads > 0, drive->sampler.lost > 0);
         lost += drive->sampler.lost > 0;
     }
     EXPECT_GT(frames, 20000u);

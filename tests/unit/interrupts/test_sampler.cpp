@@ -39,7 +39,17 @@ struct part_t {
     int64_t most() const { return least() + (int64_t(1) << bits) - 1; }
 };
 
-bool holds(sampler_condition_t condition, int64_t value, int64_t level, const int64_t *last) {
+// Records of the ring: the last one begins before SAMPLER_WORDS.
+unsigned capacity_of(unsigned record_words) {
+    return (SAMPLER_WORDS + record_words - 1) / record_words;
+}
+
+bool waits(const sampler_t &sampler) {
+    return sampler.waiting_floor > 0;
+}
+
+// last: value at the event before, nullptr at the first one; armed: value at the arming.
+bool holds(sampler_condition_t condition, int64_t value, int64_t level, const int64_t *last, int64_t armed) {
     switch (condition) {
     case SAMPLER_AT_ONCE:
         return true;
@@ -54,7 +64,7 @@ bool holds(sampler_condition_t condition, int64_t value, int64_t level, const in
     case SAMPLER_EQUAL:
         return value == level;
     default:
-        return last && value != *last;
+        return value != armed;
     }
 }
 
@@ -66,7 +76,7 @@ sampler_setup_t any_setup(std::mt19937 &random, const part_t &part, int64_t leve
     }
     setup.event = sampler_event_t(1 + random() % 4);
     setup.divider = uint16_t(random() % 3 == 0 ? 1 : 1 + random() % 5);
-    const unsigned most = SAMPLER_WORDS / setup.channels - 2;
+    const unsigned most = capacity_of(setup.channels) - 2;
     const unsigned kind = random() % 4;
     setup.before = uint16_t(kind == 0 ? 0 : kind == 1 ? most : random() % (most + 1));
     setup.condition = sampler_condition_t(random() % SAMPLER_CONDITIONS);
@@ -84,7 +94,7 @@ part_t any_part(std::mt19937 &random) {
 
 class Sampler : public testing::Test {
   protected:
-    void event(uint32_t time_us = 0) { sampler_record(&sampler, memory.data(), WORDS, time_us); }
+    void event(uint32_t time_us = 0) { sampler_record(&sampler, memory.data(), WORDS, time_us, 0); }
 
     // Two channels, as a stream or a buffer.
     static sampler_setup_t plain() {
@@ -124,7 +134,11 @@ class Course {
 
     // Whether the buffer is complete.
     bool run() {
-        EXPECT_TRUE(sampler_arm(&sampler_, &setup_, false, WORDS));
+        if (random_() % 4 != 0) { // what is recorded may have another value at the first event
+            step();
+        }
+        armed_ = part_.of(memory_[setup_.variable.word]);
+        EXPECT_TRUE(sampler_arm(&sampler_, &setup_, false, memory_.data(), WORDS));
         for (int64_t event = 0; event < 30000; event++) {
             if (event == trigger_now_) {
                 sampler_trigger(&sampler_);
@@ -136,14 +150,13 @@ class Course {
                 records_.push_back(memory_);
             }
             EXPECT_EQ(sampler_.event, uint32_t(setup_.event));
-            sampler_record(&sampler_, memory_.data(), WORDS, uint32_t(random_()));
+            sampler_record(&sampler_, memory_.data(), WORDS, uint32_t(random_()), 0);
             if (trigger_record_ >= 0 && int64_t(records_.size()) == trigger_record_ + capacity() - before_) {
                 expect_complete();
                 return true;
             }
-            const sampler_state_t state = trigger_record_ < 0 ? SAMPLER_WAITS : SAMPLER_FOLLOWS;
-            if (sampler_.state != state) {
-                ADD_FAILURE() << "state " << sampler_.state << " at event " << event << ", expected " << state;
+            if (sampler_.state != SAMPLER_ARMED || waits(sampler_) != (trigger_record_ < 0)) {
+                ADD_FAILURE() << "state " << sampler_.state << " at event " << event << ", waits " << waits(sampler_);
                 return false;
             }
         }
@@ -153,7 +166,7 @@ class Course {
     sampler_condition_t condition() const { return setup_.condition; }
 
   private:
-    int64_t capacity() const { return int64_t(SAMPLER_WORDS) / setup_.channels; }
+    int64_t capacity() const { return capacity_of(setup_.channels); }
 
     void step() {
         for (uint32_t &word : memory_) {
@@ -172,7 +185,7 @@ class Course {
     // Records that precede an event belong to earlier events.
     void expect_trigger(int64_t event) {
         if (trigger_record_ < 0 &&
-            (event >= trigger_now_ || holds(setup_.condition, value_, level_, has_last_ ? &last_ : nullptr))) {
+            (event >= trigger_now_ || holds(setup_.condition, value_, level_, has_last_ ? &last_ : nullptr, armed_))) {
             trigger_record_ = (event + setup_.divider - 1) / setup_.divider;
             trigger_events_ = trigger_record_ * setup_.divider - event;
             before_ = std::min(int64_t(setup_.before), int64_t(records_.size()));
@@ -187,9 +200,9 @@ class Course {
         EXPECT_EQ(sampler_.capacity, capacity());
         EXPECT_EQ(sampler_.record_words, setup_.channels);
         EXPECT_EQ(sampler_.trigger_events, trigger_events_);
-        EXPECT_EQ(sampler_.missing, setup_.before - before_);
+        EXPECT_EQ(sampler_.capacity - sampler_.trigger_left, before_);
         const auto words = uint32_t(capacity() * setup_.channels);
-        ASSERT_LT(sampler_.place, words);
+        ASSERT_LE(sampler_.place, words);
         uint32_t place = sampler_.place; // of the oldest record, which `before` others follow up to the trigger
         for (int64_t k = trigger_record_ - before_; k < int64_t(records_.size()); k++) {
             for (unsigned i = 0; i < setup_.channels; i++, place++) {
@@ -205,7 +218,7 @@ class Course {
     sampler_setup_t setup_;
     sampler_t sampler_{};
     words_t memory_{};
-    int64_t value_ = 0, last_ = 0;
+    int64_t value_ = 0, last_ = 0, armed_ = 0;
     bool has_last_ = false;
     int64_t trigger_record_ = -1, trigger_events_ = 0, before_ = 0;
     std::vector<words_t> records_;
@@ -232,18 +245,40 @@ TEST_F(Sampler, records_each_deferred_step_once_at_the_first_control_interrupt_a
         sampler_setup_t setup = plain();
         setup.event = deferred ? SAMPLER_EVENT_DEFERRED : SAMPLER_EVENT_CONTROL;
         EXPECT_TRUE((setup.event & SAMPLER_IN_CONTROL) != 0);
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
-        uint32_t steps = UINT32_MAX - 100, recorded = steps;
-        sampler.step = steps;
-        for (uint32_t k = 0; k < 1000; k++) {
-            steps += random() % 2; // some take longer than a period
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
+        for (uint32_t k = 0, skipped = 0; k < 1000; k++) {
+            skipped = random() % 2 ? skipped + 1 : 0; // some steps take longer than a period
             const uint32_t written = sampler.written;
-            sampler_record_control(&sampler, memory.data(), WORDS, k, steps);
-            ASSERT_EQ(sampler.written - written, deferred ? steps - recorded : 1);
-            recorded = steps;
+            sampler_record(&sampler, memory.data(), WORDS, k, skipped);
+            ASSERT_EQ(sampler.written - written, deferred && skipped > 0 ? 0 : 1);
         }
     }
     EXPECT_EQ((SAMPLER_EVENT_BACKGROUND | SAMPLER_EVENT_IDENTIFY) & SAMPLER_IN_CONTROL, 0u);
+}
+
+TEST(SamplerMemory, every_word_of_a_drive_of_any_size_is_the_one_that_is_recorded) {
+    std::vector<uint32_t> memory(SAMPLER_DRIVE_WORDS_MAX);
+    for (uint32_t i = 0; i < memory.size(); i++) {
+        memory[i] = 3 * i + 1;
+    }
+    sampler_setup_t setup{};
+    setup.channels = 1;
+    setup.event = SAMPLER_EVENT_CONTROL;
+    setup.divider = 1;
+    sampler_t sampler{};
+    for (const uint32_t words : {1u, 2u, 3u, 255u, 7552u, 32768u, 50001u, 65535u, 65536u}) {
+        for (uint32_t i = 0; i < words; i++) {
+            setup.word[0] = uint16_t(i);
+            ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory.data(), words));
+            sampler_record(&sampler, memory.data(), words, 0, 0);
+            ASSERT_EQ(sampler.ring[0], memory[i]) << words;
+        }
+        for (const uint32_t part : {0u, 0x7FFFFFFFu, 0xFFFFFFFFu}) { // changed in memory
+            sampler.part[0] = part;
+            sampler_record(&sampler, memory.data(), words, 0, 0);
+            ASSERT_EQ(sampler.ring[sampler.place - 1], memory[uint64_t(part) * words >> 32]);
+        }
+    }
 }
 
 TEST_F(Sampler, compares_an_unsigned_word_with_a_level_of_its_kind) {
@@ -252,15 +287,15 @@ TEST_F(Sampler, compares_an_unsigned_word_with_a_level_of_its_kind) {
     setup.level = int32_t(0x80000001u);
     for (const sampler_condition_t condition : {SAMPLER_AT_LEAST, SAMPLER_RISING}) {
         setup.condition = condition;
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, WORDS));
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory.data(), WORDS));
         for (const uint32_t below : {0u, 0x7FFFFFFFu, 0x80000000u}) {
             memory[5] = below;
             event();
-            ASSERT_EQ(sampler.state, SAMPLER_WAITS) << below;
+            ASSERT_TRUE(waits(sampler)) << below;
         }
         memory[5] = 0x80000001u;
         event();
-        EXPECT_EQ(sampler.state, SAMPLER_FOLLOWS);
+        EXPECT_FALSE(waits(sampler));
     }
 }
 
@@ -269,7 +304,7 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
     sampler_setup_t setup = plain();
     setup.condition = SAMPLER_EQUAL;
     setup.level = -1;
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, false, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory.data(), WORDS));
     for (int k = 0; k < 100; k++) {
         event();
     }
@@ -277,7 +312,7 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
         sampler_setup_t other = plain();
         change(other);
         const sampler_t before = sampler;
-        EXPECT_FALSE(sampler_arm(&sampler, &other, streams, WORDS)) << name;
+        EXPECT_FALSE(sampler_arm(&sampler, &other, streams, memory.data(), WORDS)) << name;
         EXPECT_EQ(std::memcmp(&before, &sampler, sizeof before), 0) << name;
     };
     for (const bool streams : {false, true}) {
@@ -310,11 +345,21 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
             "variable", [](auto &s) { s.variable.word = WORDS; }, streams);
         refuses(
             "left", [](auto &s) { s.variable.left = 32; }, streams);
+        for (const int32_t level : {-1, 256, INT32_MIN}) {
+            refuses(
+                "level",
+                [&](auto &s) {
+                    s.condition = SAMPLER_AT_LEAST;
+                    s.variable = {3, 24, 24, false};
+                    s.level = level;
+                },
+                streams);
+        }
         refuses(
             "right", [](auto &s) { s.variable.right = 255; }, streams);
     }
     for (unsigned channels = 1; channels <= SAMPLER_CHANNELS_MAX; channels++) {
-        const unsigned most = SAMPLER_WORDS / channels - 2;
+        const unsigned most = capacity_of(channels) - 2;
         for (const unsigned before : {most + 1, 65535u}) {
             refuses("before", [&](auto &s) {
                 s.channels = uint8_t(channels);
@@ -325,9 +370,9 @@ TEST_F(Sampler, refuses_each_member_out_of_range_with_nothing_changed) {
         setup.channels = uint8_t(channels);
         setup.before = uint16_t(most);
         sampler_t other{};
-        EXPECT_TRUE(sampler_arm(&other, &setup, false, WORDS)) << "the largest that there is room for";
+        EXPECT_TRUE(sampler_arm(&other, &setup, false, memory.data(), WORDS)) << "the largest that there is room for";
         setup.before = 65535;
-        EXPECT_TRUE(sampler_arm(&other, &setup, true, WORDS)) << "a stream has no trigger";
+        EXPECT_TRUE(sampler_arm(&other, &setup, true, memory.data(), WORDS)) << "a stream has no trigger";
     }
 }
 
@@ -335,8 +380,8 @@ TEST_F(Sampler, streams_every_record_in_order_with_its_time_while_a_consumer_tak
     for (unsigned seed = 0; seed < 60; seed++) {
         std::mt19937 random(seed);
         sampler_setup_t setup = any_setup(random, {0, 32, true}, 0);
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
-        const uint32_t capacity = SAMPLER_WORDS / (setup.channels + 1u);
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
+        const uint32_t capacity = capacity_of(setup.channels + 1u);
         std::vector<uint32_t> kept; // numbers of the events whose records are in the ring
         size_t taken = 0;
         uint32_t lost = 0, patience = 0;
@@ -370,29 +415,29 @@ TEST_F(Sampler, streams_every_record_in_order_with_its_time_while_a_consumer_tak
 
 TEST_F(Sampler, a_record_that_is_being_taken_is_overwritten_only_after_it_is_given_back) {
     const sampler_setup_t setup = plain();
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
-    for (uint32_t k = 0; k < SAMPLER_WORDS / 3; k++) {
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
+    for (uint32_t k = 0; k < capacity_of(3); k++) {
         number(k);
     }
     const sampler_t full = sampler;
     record_t record{};
     ASSERT_TRUE(sampler_take(&sampler, record.data()));
     sampler.taken = full.taken; // the last store of taking is still to come
-    number(SAMPLER_WORDS / 3);
+    number(capacity_of(3));
     EXPECT_EQ(sampler.lost, 1u);
     EXPECT_EQ(std::memcmp(sampler.ring, full.ring, sizeof full.ring), 0);
 }
 
 TEST_F(Sampler, counts_records_beyond_the_range_of_the_counter) {
     const sampler_setup_t setup = plain();
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
     sampler.written = sampler.taken = 0xFFFFFFF0u;
     record_t record{};
-    for (uint32_t k = 0; k < SAMPLER_WORDS / 3 + 5; k++) {
+    for (uint32_t k = 0; k < capacity_of(3) + 5; k++) {
         number(k);
     }
     EXPECT_EQ(sampler.lost, 5u);
-    for (uint32_t k = 0; k < SAMPLER_WORDS / 3; k++) {
+    for (uint32_t k = 0; k < capacity_of(3); k++) {
         ASSERT_TRUE(sampler_take(&sampler, record.data()));
         ASSERT_EQ(record[0], 25 * k);
     }
@@ -404,7 +449,7 @@ TEST_F(Sampler, stops_and_is_armed_anew_in_any_state) {
     setup.before = 10;
     record_t record{};
     for (const int events : {0, 5, 12, 100000}) { // armed, waits, follows, complete
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, WORDS));
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory.data(), WORDS));
         for (int k = 0; k < events && sampler.event != 0; k++) {
             number(uint32_t(k));
         }
@@ -415,11 +460,11 @@ TEST_F(Sampler, stops_and_is_armed_anew_in_any_state) {
         EXPECT_EQ(std::memcmp(sampler.ring, before.ring, sizeof before.ring), 0);
         EXPECT_FALSE(sampler_take(&sampler, record.data())) << "it is no stream";
     }
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
     number(1);
     sampler_stop(&sampler);
     EXPECT_FALSE(sampler_take(&sampler, record.data()));
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
     EXPECT_FALSE(sampler_take(&sampler, record.data())) << "none of the stream before";
     number(2);
     ASSERT_TRUE(sampler_take(&sampler, record.data()));
@@ -428,11 +473,11 @@ TEST_F(Sampler, stops_and_is_armed_anew_in_any_state) {
 
 TEST_F(Sampler, trigger_now_has_no_effect_on_a_stream_and_on_what_is_complete) {
     const sampler_setup_t setup = plain();
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, true, memory.data(), WORDS));
     sampler_trigger(&sampler);
     number(1);
     EXPECT_EQ(sampler.state, SAMPLER_STREAMS);
-    ASSERT_TRUE(sampler_arm(&sampler, &setup, false, WORDS));
+    ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory.data(), WORDS));
     while (sampler.event != 0) {
         number(1);
     }
@@ -472,13 +517,17 @@ TEST(SamplerCorrupted, members_that_changed_in_memory_lead_nowhere_outside_the_r
     for (unsigned k = 0; k < 20000; k++) {
         const bool streams = random() % 2 == 0;
         const sampler_setup_t setup = any_setup(random, any_part(random), 0);
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, streams, WORDS));
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, streams, guarded.last(WORDS), WORDS));
         for (unsigned events = random() % 20; events > 0; events--) {
-            sampler_record(&sampler, guarded.last(WORDS), WORDS, k);
+            sampler_record(&sampler, guarded.last(WORDS), WORDS, k, random() % 2);
         }
-        uint32_t *const whole[] = {&sampler.record_words, &sampler.capacity,  &sampler.place,
-                                   &sampler.missing,      &sampler.following, &sampler.countdown,
-                                   &sampler.written,      &sampler.taken,     &sampler.taken_place};
+        uint32_t *const whole[] = {
+            &sampler.room,          &sampler.waiting_floor, &sampler.left,
+            &sampler.countdown,     &sampler.divider,       &sampler.place,
+            &sampler.record_words,  &sampler.last_channel,  &sampler.capacity,
+            &sampler.trigger_part,  &sampler.factor,        &sampler.window_end,
+            &sampler.window_length, &sampler.written,       &sampler.waits_for_outside,
+            &sampler.taken,         &sampler.taken_place,   &sampler.part[random() % SAMPLER_CHANNELS_MAX]};
         for (uint32_t *member : whole) {
             const uint32_t any[] = {0,
                                     1,
@@ -490,15 +539,9 @@ TEST(SamplerCorrupted, members_that_changed_in_memory_lead_nowhere_outside_the_r
                                     *member ^ 1u << random() % 32};
             *member = random() % 3 == 0 ? any[random() % 8] : *member;
         }
-        sampler.setup.channels = uint8_t(random() % 2 ? random() : sampler.setup.channels);
-        sampler.setup.word[random() % SAMPLER_CHANNELS_MAX] = uint16_t(random());
-        sampler.setup.variable.word = uint16_t(random());
-        sampler.setup.variable.left = uint8_t(random());
-        sampler.setup.variable.right = uint8_t(random());
-        sampler.setup.divider = uint16_t(random() % 3);
         record_t record[2] = {}; // the second one is behind the first
         for (unsigned events = 0; events < 40; events++) {
-            sampler_record(&sampler, guarded.last(WORDS), WORDS, k);
+            sampler_record(&sampler, guarded.last(WORDS), WORDS, k, random() % 2);
             sampler_take(&sampler, record[0].data());
         }
         ASSERT_EQ(record[1], record_t{});

@@ -35,7 +35,7 @@ void event() {
     }
     events++;
     if (*static_cast<volatile uint32_t *>(&sampler.event) != 0) {
-        sampler_record(&sampler, memory, WORDS, 25 * (events - 1));
+        sampler_record(&sampler, memory, WORDS, 25 * (events - 1), 0);
     }
 }
 
@@ -82,12 +82,12 @@ class Interrupted : public testing::Test {
     static void arm(unsigned channels, bool streams, uint16_t before = 0) {
         sampler_setup_t setup = setup_of(channels);
         setup.before = before;
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, streams, WORDS));
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, streams, memory, WORDS));
     }
 
     static void expect_record(const std::array<uint32_t, 1 + SAMPLER_CHANNELS_MAX> &record, uint32_t number) {
         EXPECT_EQ(record[0], 25 * number);
-        for (unsigned i = 0; i < sampler.setup.channels; i++) {
+        for (unsigned i = 0; i <= sampler.last_channel; i++) {
             EXPECT_EQ(record[1 + i], 1000003u * number + i);
         }
     }
@@ -98,7 +98,7 @@ class Interrupted : public testing::Test {
 
 TEST_F(Interrupted, taking_from_a_full_ring_neither_mixes_nor_loses_a_record_uncounted) {
     constexpr unsigned CHANNELS = SAMPLER_CHANNELS_MAX;
-    constexpr uint32_t CAPACITY = SAMPLER_WORDS / (CHANNELS + 1);
+    constexpr uint32_t CAPACITY = (SAMPLER_WORDS + CHANNELS) / (CHANNELS + 1);
     unsigned lost_before = 0, kept_after = 0;
     for (unsigned after = 1;; after++) {
         arm(CHANNELS, true);
@@ -163,15 +163,16 @@ TEST_F(Interrupted, arming_anew_begins_with_a_whole_record_whatever_was_recorded
                 event();
             }
             const uint32_t first = events;
-            if (!interrupted(after, [&] { sampler_arm(&sampler, &setup, streams, WORDS); })) {
+            if (!interrupted(after, [&] { sampler_arm(&sampler, &setup, streams, memory, WORDS); })) {
                 break;
             }
-            ASSERT_EQ(sampler.state, streams ? SAMPLER_STREAMS : SAMPLER_WAITS);
-            ASSERT_LE(sampler.written, 1u) << "event after instruction " << after;
-            const uint32_t begin = first + 1 - sampler.written; // the event was of the old one or is of the new one
-            const uint32_t words = streams ? 4 : 3;
-            ASSERT_EQ(sampler.place, words * sampler.written);
-            ASSERT_EQ(sampler.missing, streams ? 5u : 5u - sampler.written);
+            ASSERT_EQ(sampler.state, streams ? SAMPLER_STREAMS : SAMPLER_ARMED);
+            const uint32_t words = streams ? 4 : 3, records = sampler.place / words;
+            ASSERT_LE(records, 1u) << "event after instruction " << after;
+            const uint32_t begin = first + 1 - records; // the event was of the old one or is of the new one
+            ASSERT_EQ(sampler.place, words * records);
+            ASSERT_EQ(sampler.written, streams ? records : 0);
+            ASSERT_EQ(sampler.left, streams ? sampler.capacity : sampler.capacity - records);
             while (events < begin + 5) {
                 event();
             }
@@ -195,7 +196,7 @@ TEST_F(Interrupted, what_is_stopped_records_no_more_and_a_complete_buffer_stays_
             if (!interrupted(after, [] { sampler_stop(&sampler); })) {
                 break;
             }
-            const bool recorded = sampler.written + sampler.lost != before.written + before.lost;
+            const bool recorded = sampler.countdown != before.countdown || sampler.place != before.place;
             ASSERT_EQ(sampler.event, 0u);
             ASSERT_EQ(sampler.state, recorded && !streams ? SAMPLER_COMPLETE : SAMPLER_OFF)
                 << "event after instruction " << after;
@@ -213,14 +214,14 @@ TEST_F(Interrupted, the_trigger_comes_before_or_after_the_event) {
         sampler_setup_t setup = setup_of(1);
         setup.condition = SAMPLER_EQUAL;
         setup.level = -7;
-        setup.variable = {0, 0, 31, false};
-        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, WORDS));
+        setup.variable = {0, 0, 0, true};
+        ASSERT_TRUE(sampler_arm(&sampler, &setup, false, memory, WORDS));
         if (!interrupted(after, [] { sampler_trigger(&sampler); })) {
             break;
         }
-        ASSERT_TRUE(sampler.state == SAMPLER_WAITS || sampler.state == SAMPLER_FOLLOWS);
         event();
-        ASSERT_EQ(sampler.state, SAMPLER_FOLLOWS);
+        ASSERT_EQ(sampler.state, SAMPLER_ARMED);
+        ASSERT_EQ(sampler.waiting_floor, 0u);
     }
 }
 

@@ -120,7 +120,7 @@ class XcpBench : public testing::Test {
     // An event of the drive with its whole memory.
     void event(sampler_event_t at) {
         if (drive->sampler.event == uint32_t(at)) {
-            sampler_record(&drive->sampler, drive.get(), DRIVE_WORDS, time_us);
+            sampler_record(&drive->sampler, drive.get(), DRIVE_WORDS, time_us, 0);
         }
     }
 

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -101,18 +101,38 @@ def _raw(text: str, quantity: Quantity, expression: str) -> float:
     return value / quantity.factor
 
 
+_RING = ("record_words", "capacity", "place", "trigger_left", "trigger_events")
+"""Members of sampler_t."""
+
+
+@dataclass(frozen=True)
+class _Ring:
+    """A complete buffer. begin: address, bytes; the others: see sampler_t."""
+
+    begin: int
+    record_words: int
+    capacity: int
+    place: int
+    trigger_left: int
+    trigger_events: int
+
+    @property
+    def bytes(self) -> int:
+        return _WORD_BYTES * self.record_words * self.capacity
+
+
 class Scope:
     """An armed buffer of a session's drive. recording: what the last read() has returned; title: its trigger; replaced:
     the buffer, of which a drive has one, has been armed anew since."""
 
-    def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], before: int, period_s: float,
-                 divider: int, title: str) -> None:
+    def __init__(self, session: LoggingClient, quantities: Sequence[Quantity], period_s: float, divider: int,
+                 title: str) -> None:
         self.recording: Recording | None = None
         self.replaced = False
         self.title = title
         self._session = session
         self._quantities = list(quantities)
-        self._before, self._period_s, self._divider = before, period_s, divider
+        self._period_s, self._divider = period_s, divider
 
     def trigger(self) -> None:
         """Triggers now, whatever the condition."""
@@ -130,8 +150,9 @@ class Scope:
                 if self._session.time_ns >= deadline_ns:
                     raise ScopeError(f"the trigger has not come, or the buffer is not complete, within {timeout:g} s")
                 self._session.run_for(_POLL_S)
-        *_, recording = self.parts()
-        return cast(Recording, recording)
+            ring = self._ring(master)
+            read = _fetched(master, ring.begin, ring.bytes)
+        return self._decoded(ring, read)
 
     def is_complete(self) -> bool:
         """The buffer is to be read."""
@@ -141,21 +162,24 @@ class Scope:
     def parts(self, words: int = sys.maxsize) -> Iterator[Recording | None]:
         """Reads a complete buffer, with what else the caller does between two parts of so many words: None after each,
         at last the recording."""
-        variables = variables_of(self._session)
         with connected(self._session) as master:
-            record_words, capacity, place, missing, late = (
-                _member(master, variables, f"sampler.{name}")
-                for name in ("record_words", "capacity", "place", "missing", "trigger_events"))
-        begin, end = variables.layout.bits("sampler.ring").start // 8, _WORD_BYTES * record_words * capacity
+            ring = self._ring(master)
         read = bytearray()
-        while len(read) < end:
+        while len(read) < ring.bytes:
             with connected(self._session) as master:
-                master.setMta(begin + len(read))
-                read += bytes(master.fetch(min(_WORD_BYTES * words, end - len(read))))
+                read += _fetched(master, ring.begin + len(read), min(_WORD_BYTES * words, ring.bytes - len(read)))
             yield None
-        records = np.roll(np.frombuffer(read, "<u4"), -place).reshape(capacity, record_words)
-        self.recording = self._recording(records, self._before - missing, late)
-        yield self.recording
+        yield self._decoded(ring, bytes(read))
+
+    def _ring(self, master: Master) -> _Ring:
+        variables = variables_of(self._session)
+        values = (_member(master, variables, f"sampler.{name}") for name in _RING)
+        return _Ring(variables.layout.bits("sampler.ring").start // 8, *values)
+
+    def _decoded(self, ring: _Ring, read: bytes) -> Recording:
+        records = np.roll(np.frombuffer(read, "<u4"), -ring.place).reshape(ring.capacity, ring.record_words)
+        self.recording = self._recording(records, ring.capacity - ring.trigger_left, ring.trigger_events)
+        return self.recording
 
     def _is_complete(self, master: Master) -> bool:
         variables = variables_of(self._session)
@@ -182,8 +206,8 @@ def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = No
     _check(divider, before)
     with connected(session) as master:
         _check_layout(master, variables)
-        size = variables.layout.bits("sampler.ring")
-        capacity = len(size) // (8 * _WORD_BYTES) // len(quantities)
+        words = len(variables.layout.bits("sampler.ring")) // (8 * _WORD_BYTES) - CHANNELS_MAX
+        capacity = -(-words // len(quantities))  # the last record begins within them
         records_before = min(int(before * capacity), capacity - 2)
         of = condition.quantity or quantities[0]
         first = of.variable.address % _WORD_BYTES
@@ -196,7 +220,7 @@ def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = No
         for number, quantity in enumerate(quantities):
             _write(master, "channel", quantity.variable.address // _WORD_BYTES * _WORD_BYTES, number)
         _write(master, "command", _COMMANDS["arm"])
-    return Scope(session, quantities, records_before, 1.0 / _control_rate_hz(session), divider, trigger or "at once")
+    return Scope(session, quantities, 1.0 / _control_rate_hz(session), divider, trigger or "at once")
 
 
 def _check(divider: Any, before: Any) -> None:
@@ -229,6 +253,11 @@ def _check_layout(master: Master, variables: Variables) -> None:
 def _write(master: Master, word: str, value: int, number: int = 0) -> None:
     master.setMta(AREA_SCOPE + _WORD_BYTES * (_WORDS.index(word) + number))
     master.download(struct.pack("<I", operator.index(value) & 0xFFFFFFFF))
+
+
+def _fetched(master: Master, address: int, size: int) -> bytes:
+    master.setMta(address)
+    return bytes(master.fetch(size))
 
 
 def _member(master: Master, variables: Variables, path: str) -> int:

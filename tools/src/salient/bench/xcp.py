@@ -33,7 +33,8 @@ RESPONSE_TIMEOUT_S = 2.0
 """Long enough for a session whose time moves by itself, which reads what came before the response first."""
 _POLL_NS = 100_000
 _UPLOAD, _DATA_BYTES = 0xF5, 7
-_RESPONSE, _FIRST_OF_RESPONSES = 0xFF, 0xFC
+_RESPONSE, _ERROR, _EVENT, _FIRST_OF_RESPONSES = 0xFF, 0xFE, 0xFD, 0xFC
+"""Events and service requests answer no command."""
 _INSTALL = "XCP needs the package pyxcp: pip install pyxcp"
 
 
@@ -52,6 +53,7 @@ class SessionInterface:
         self._command_id = session.drive_database.get_message_by_name("XCP_COMMAND").frame_id
         self._response_id = session.drive_database.get_message_by_name("XCP_RESPONSE").frame_id
         self._received: queue.SimpleQueue[can.Message] = queue.SimpleQueue()
+        self._seen = len(session.log)
 
     @property
     def identifiers(self) -> tuple[int, int]:
@@ -65,7 +67,9 @@ class SessionInterface:
     def send(self, message: can.Message) -> None:
         """Sends a command and lets time pass until it is answered. XcpError: it is not within RESPONSE_TIMEOUT_S."""
         expected = -(-message.data[1] // _DATA_BYTES) if message.data[0] == _UPLOAD else 1
-        seen = len(self._session.log)
+        for frame in self._new_frames():  # which came since the last command
+            if frame.data[0] == _EVENT:
+                self._received.put(frame)
         message.is_extended_id = False
         self._session.send(message)
         deadline_ns = self._session.time_ns + round(1e9 * RESPONSE_TIMEOUT_S)
@@ -74,11 +78,17 @@ class SessionInterface:
                 raise XcpError(f"no response to the XCP command {message.data.hex(' ')}; does the firmware of the "
                                "drive have XCP?")
             self._session.advance_to(self._session.time_ns + _POLL_NS)
-            for _, frame in self._session.log[seen:]:
-                if self._is_response(frame):
-                    self._received.put(frame)
+            for frame in self._new_frames():
+                self._received.put(frame)
+                if frame.data[0] in (_RESPONSE, _ERROR):
                     expected = expected - 1 if frame.data[0] == _RESPONSE else 0
-            seen = len(self._session.log)
+
+    def _new_frames(self) -> list[can.Message]:
+        """The drive's responses and events that the log has since the last call; a user of it may have emptied it."""
+        log = self._session.log
+        frames = [frame for _, frame in log[self._seen if self._seen <= len(log) else 0:] if self._is_response(frame)]
+        self._seen = len(log)
+        return frames
 
     def _is_response(self, message: can.Message) -> bool:
         return (message.arbitration_id == self._response_id and not message.is_extended_id

@@ -19,6 +19,8 @@ from salient.target.trace import Stack, Trace
 
 HANDLERS = {"interrupt": CONTROL, "deferred": "deferred_handler"}
 """Symbols of the handlers by section of the baseline; images without a deferred interrupt have only the first."""
+RECORDER = "sampler_record"
+"""Function of the triggered buffer, which by the facts never runs."""
 _ALL = "all"
 _FUNCTIONS_SHOWN = 30
 
@@ -32,6 +34,19 @@ def bound(variant: str, build: str, section: str = "interrupt") -> Bound | None:
     if handler not in elf.symbols() and handler != CONTROL:
         return None
     return Model(elf, _facts(), of.controller, handler).solve()
+
+
+@lru_cache
+def armed_bound(variant: str, build: str) -> int:
+    """Instructions of the control interrupt of a drive whose triggered buffer is armed, with any number of channels and
+    any trigger."""
+    of = VARIANTS[variant]
+    facts = _facts()
+    never = [fact for fact in facts.never if RECORDER not in fact.functions]
+    if len(never) == len(facts.never):
+        raise UsageError(f"{RECORDER}: no fact says that it never runs")
+    return Model(_image_of(image(of.machine, build)), facts.model_copy(update={"never": never}),
+                 of.controller).solve().instructions
 
 
 _image_of = lru_cache(ElfImage)
@@ -56,6 +71,9 @@ def run(variant: str, build: str, longest_runs: Mapping[str, int]) -> int:
             if found:
                 longest = longest_runs.get(name) if section == "interrupt" else None
                 print(_line(f"{VARIANTS[name].label}, {handler}", found.instructions, longest), flush=True)
+                if section == "interrupt":
+                    more = armed_bound(name, build) - found.instructions
+                    print(f"{VARIANTS[name].label}, {handler}, triggered buffer armed: {more} more", flush=True)
                 if variant != _ALL:
                     print(details(found))
     return 0
