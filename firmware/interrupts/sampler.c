@@ -144,8 +144,8 @@ COLD void sampler_stop(sampler_t *sampler) {
     }
 }
 
-/* Without a division of 64 bits: the part exceeds the word's begin by less than 2^-16 of the drive, which is less than a
- * word. */
+/* Without a division of 64 bits: the part exceeds the word's begin by less than 2^-16 of the drive, which is less than
+ * a word. */
 COLD static uint32_t part_of(uint32_t word, uint32_t words) {
     return word * (UINT32_MAX / words + 1u);
 }
