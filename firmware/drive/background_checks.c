@@ -206,8 +206,9 @@ COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
     }
 }
 
-/* False when the request in effect is not the one that the bus has brought: one of both copies has changed. The last one
- * before a bus-off is not taken, and lets the one before age; the ramp of overdue commands runs after a stop, too. */
+/* False when the request in effect is not the one that the bus has brought: one of both copies has changed. The last
+ * one before a bus-off is not taken, and lets the one before age; the ramp of overdue commands runs after a stop, too.
+ */
 COLD static bool is_commanded(const drive_t *drive) {
     const command_request_t received = drive->comms.command.request;
     return drive->command.request == received || drive->comms.bus.run_inhibited ||
