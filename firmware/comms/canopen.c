@@ -104,8 +104,10 @@ static void respond_guard(canopen_t *canopen, const canopen_context_t *context) 
     canopen_send(canopen, context, HEARTBEAT_ID + canopen->node, &state, 1);
 }
 
+/* 0: an entry without a time, or a node, is not used. */
 static uint32_t consumed_node(const canopen_t *canopen, unsigned consumer) {
-    return (uint32_t)canopen->values[CANOPEN_VALUE_CONSUMER + consumer] >> NODE_SHIFT;
+    const uint32_t entry = (uint32_t)canopen->values[CANOPEN_VALUE_CONSUMER + consumer];
+    return (entry & UINT16_MAX) != 0 ? entry >> NODE_SHIFT : 0;
 }
 
 static void receive_heartbeat(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
@@ -168,14 +170,20 @@ static void watch(canopen_t *canopen, const canopen_context_t *context, canopen_
     }
 }
 
+/* A stop ends by itself, but for a quick stop that stays. */
+static bool goes_on(const canopen_drive_t *drive) {
+    return drive->state == CANOPEN_OPERATION_ENABLED
+               ? !drive->stopping
+               : drive->state == CANOPEN_QUICK_STOP_ACTIVE && drive->after == CANOPEN_QUICK_STOP_ACTIVE;
+}
+
 /* Without another supervision the silence of all masters is watched while the drive is enabled. */
 static void watch_silence(canopen_t *canopen, const canopen_context_t *context, bool watched) {
     const uint32_t limit_us = (uint32_t)canopen->values[CANOPEN_VALUE_SILENCE] * US_PER_MS;
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         watched = watched || (canopen->rpdo[pdo].seen && canopen->values[CANOPEN_VALUE_RPDO_TIMER + pdo] != 0);
     }
-    if (canopen->drive.state == CANOPEN_OPERATION_ENABLED && !canopen->drive.stopping && !watched &&
-        context->time_us - canopen->heard_us > limit_us) {
+    if (goes_on(&canopen->drive) && !watched && context->time_us - canopen->heard_us > limit_us) {
         canopen_drive_lose_master(canopen, context, CANOPEN_MASTER_SILENT);
     }
 }

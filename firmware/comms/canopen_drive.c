@@ -77,11 +77,12 @@ static void enable(canopen_t *canopen, const canopen_context_t *context) {
     canopen_demand_begin(canopen);
 }
 
-/* By its option code from operation enabled: at once, or after a ramp. */
+/* By its option code from operation enabled: at once, or after a ramp, which goes on when the command is repeated. */
 static void leave(canopen_t *canopen, const canopen_context_t *context, canopen_state_t to, unsigned option) {
+    const canopen_drive_t *drive = &canopen->drive;
     if (canopen->values[option] == 0) {
         rest(canopen, context, to);
-    } else {
+    } else if (!drive->stopping || drive->after != to) {
         stop(canopen, CANOPEN_OPERATION_ENABLED, to, false);
     }
 }

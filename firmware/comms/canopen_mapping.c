@@ -82,10 +82,11 @@ static uint32_t check_id(const canopen_t *canopen, unsigned value, unsigned pdo,
     const uint32_t extra = wanted & ~(CANOPEN_PDO_NOT_VALID | CANOPEN_PDO_NO_REMOTE | CANOPEN_PDO_ID);
     const uint32_t present = canopen_mapping_id(canopen, value, pdo);
     const bool changed = ((wanted ^ present) & CANOPEN_PDO_ID) != 0;
-    if (extra != 0 || !canopen_mapping_is_free_id(wanted & CANOPEN_PDO_ID)) {
+    const bool valid = (wanted & CANOPEN_PDO_NOT_VALID) == 0;
+    if (extra != 0 || (valid && !canopen_mapping_is_free_id(wanted & CANOPEN_PDO_ID))) {
         return CANOPEN_VALUE;
     }
-    return changed && ((wanted | present) & CANOPEN_PDO_NOT_VALID) == 0 ? CANOPEN_STATE : CANOPEN_DONE;
+    return changed && valid && (present & CANOPEN_PDO_NOT_VALID) == 0 ? CANOPEN_STATE : CANOPEN_DONE;
 }
 
 static uint32_t check_type(int32_t type) {

@@ -171,6 +171,17 @@ static uint32_t check_signature(const canopen_object_t *object, int32_t value) {
     return wrong ? CANOPEN_NOT_STORED : CANOPEN_DONE;
 }
 
+/* A node is watched by one entry; one without a node or a time is not used (CiA 301, 7.5.2.19). */
+static uint32_t check_consumer(const canopen_t *canopen, unsigned entry, int32_t value) {
+    for (unsigned i = 0; i < CANOPEN_CONSUMERS && value >> 16 != 0 && (value & UINT16_MAX) != 0; i++) {
+        const int32_t other = canopen->values[CANOPEN_VALUE_CONSUMER + i];
+        if (i != entry && other >> 16 == value >> 16 && (other & UINT16_MAX) != 0) {
+            return CANOPEN_INCOMPATIBLE;
+        }
+    }
+    return CANOPEN_DONE;
+}
+
 /* Values of a variable within its limits that are not allowed. */
 static uint32_t check_choice(const canopen_t *canopen, const canopen_object_t *object, int32_t value) {
     bool allowed;
@@ -191,9 +202,8 @@ static uint32_t check_choice(const canopen_t *canopen, const canopen_object_t *o
     case CANOPEN_VALUE_POLARITY:
         allowed = (value & ~POLARITIES) == 0;
         break;
-    case CANOPEN_VALUE_CONSUMER: /* node and time, or neither */
-        allowed = (value >> 16 == 0) == ((value & UINT16_MAX) == 0);
-        break;
+    case CANOPEN_VALUE_CONSUMER:
+        return check_consumer(canopen, object->element, value);
     case CANOPEN_VALUE_SYNC_ID:
         allowed = canopen_mapping_is_free_id((uint32_t)value) || value == SYNC_ID;
         break;

@@ -20,7 +20,7 @@ static unsigned mapped_count(const canopen_t *canopen, unsigned value, unsigned 
     return fixed_min_u32((uint32_t)canopen->values[value + pdo], CANOPEN_MAPPED_MAX);
 }
 
-typedef enum { CHECK, WRITE, CONTROL, PASSES } pass_t;
+typedef enum { CHECK, WRITE, CONTROL } pass_t;
 
 /* Handles a value of a receive PDO in one of the passes; false: it cannot be written. */
 static bool take_value(canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object,
@@ -38,21 +38,36 @@ static bool take_value(canopen_t *canopen, const canopen_context_t *context, con
     return true;
 }
 
-/* Checks all values of a frame, then writes them, the controlword last: it finds mode and references of its frame. */
-static void take(canopen_t *canopen, const canopen_context_t *context, unsigned pdo) {
+/* A pass over the values of a frame; false: one of them cannot be written. */
+static bool pass_over(canopen_t *canopen, const canopen_context_t *context, unsigned pdo, pass_t pass) {
     const canopen_rpdo_t *rpdo = &canopen->rpdo[pdo];
     const int32_t *map = &canopen->values[CANOPEN_VALUE_RPDO_MAP + pdo * CANOPEN_MAPPED_MAX];
     const unsigned count = mapped_count(canopen, CANOPEN_VALUE_RPDO_COUNT, pdo);
-    for (pass_t pass = CHECK; pass < PASSES; pass++) {
-        unsigned at = 0;
-        for (unsigned i = 0; i < count; i++) {
-            canopen_object_t object;
-            if (canopen_mapping_find(map[i], CANOPEN_RPDO, &object) != CANOPEN_DONE ||
-                at + canopen_bytes(&object) > rpdo->length ||
-                !take_value(canopen, context, &object, canopen_unpack(&object, rpdo->data + at), pass)) {
-                return;
-            }
-            at += canopen_bytes(&object);
+    unsigned at = 0;
+    for (unsigned i = 0; i < count; i++) {
+        canopen_object_t object;
+        if (canopen_mapping_find(map[i], CANOPEN_RPDO, &object) != CANOPEN_DONE ||
+            at + canopen_bytes(&object) > rpdo->length ||
+            !take_value(canopen, context, &object, canopen_unpack(&object, rpdo->data + at), pass)) {
+            return false;
+        }
+        at += canopen_bytes(&object);
+    }
+    return true;
+}
+
+/* Checks all values of the frames of some PDOs, a bit each, and writes them, the controlwords last: a controlword finds
+ * mode and references of its frame, and of its SYNC. */
+static void take(canopen_t *canopen, const canopen_context_t *context, unsigned pdos) {
+    for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
+        if ((pdos >> pdo & 1u) != 0 &&
+            (!pass_over(canopen, context, pdo, CHECK) || !pass_over(canopen, context, pdo, WRITE))) {
+            pdos &= ~(1u << pdo);
+        }
+    }
+    for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
+        if ((pdos >> pdo & 1u) != 0) {
+            pass_over(canopen, context, pdo, CONTROL);
         }
     }
 }
@@ -80,14 +95,15 @@ static void receive(canopen_t *canopen, const canopen_context_t *context, unsign
     memcpy(rpdo->data, frame->data, length);
     rpdo->waiting = canopen->values[CANOPEN_VALUE_RPDO_TYPE + pdo] <= CANOPEN_PDO_SYNC_MAX;
     if (!rpdo->waiting) {
-        take(canopen, context, pdo);
+        take(canopen, context, 1u << pdo);
     }
 }
 
 COLD bool canopen_pdo_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS && canopen->nmt == CANOPEN_NMT_OPERATIONAL; pdo++) {
         const uint32_t id = canopen_mapping_id(canopen, CANOPEN_VALUE_RPDO_ID, pdo);
-        if ((id & CANOPEN_PDO_NOT_VALID) == 0 && (id & CANOPEN_PDO_ID) == frame->identifier) {
+        if ((id & CANOPEN_PDO_NOT_VALID) == 0 && (id & CANOPEN_PDO_ID) == frame->identifier &&
+            mapped_count(canopen, CANOPEN_VALUE_RPDO_COUNT, pdo) != 0) {
             receive(canopen, context, pdo, frame);
             return true;
         }
@@ -121,16 +137,22 @@ static void transmit(canopen_t *canopen, const canopen_context_t *context, unsig
     tpdo->syncs = 0;
     tpdo->time_us = context->time_us;
     memcpy(tpdo->data, data, 8);
-    canopen_send(canopen, context, canopen_mapping_id(canopen, CANOPEN_VALUE_TPDO_ID, pdo) & CANOPEN_PDO_ID, data,
-                 bytes);
+    if (bytes != 0) { /* else the mapping is empty, and there is no PDO */
+        canopen_send(canopen, context, canopen_mapping_id(canopen, CANOPEN_VALUE_TPDO_ID, pdo) & CANOPEN_PDO_ID, data,
+                     bytes);
+    }
 }
 
 COLD void canopen_pdo_sync(canopen_t *canopen, const canopen_context_t *context) {
+    unsigned waiting = 0;
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         if (canopen->rpdo[pdo].waiting && canopen_mapping_is_valid(canopen, CANOPEN_VALUE_RPDO_ID, pdo)) {
             canopen->rpdo[pdo].waiting = false;
-            take(canopen, context, pdo);
+            waiting |= 1u << pdo;
         }
+    }
+    take(canopen, context, waiting);
+    for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         const int32_t type = canopen->values[CANOPEN_VALUE_TPDO_TYPE + pdo];
         canopen_tpdo_t *tpdo = &canopen->tpdo[pdo];
         tpdo->syncs = (uint8_t)fixed_min_u32(tpdo->syncs + 1u, UINT8_MAX);

@@ -100,7 +100,6 @@ COLD void canopen_sdo_receive(canopen_t *canopen, const canopen_context_t *conte
     if (context->time_us - canopen->sdo.time_us > CANOPEN_SDO_SILENT_US) {
         canopen->sdo.state = CANOPEN_SDO_IDLE;
     }
-    canopen->sdo.time_us = context->time_us;
     if (request[0] == ABORT << 5) {
         canopen->sdo.state = CANOPEN_SDO_IDLE;
         return;
@@ -109,6 +108,7 @@ COLD void canopen_sdo_receive(canopen_t *canopen, const canopen_context_t *conte
         canopen_sdo_block_segment(canopen, context, request);
         return;
     }
+    canopen->sdo.time_us = context->time_us;
     switch (request[0] >> 5) {
     case DOWNLOAD_SEGMENT:
         download_segment(canopen, context, request);

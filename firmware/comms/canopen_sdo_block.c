@@ -144,7 +144,8 @@ COLD void canopen_sdo_block_segment(canopen_t *canopen, const canopen_context_t 
         canopen_sdo_abort(canopen, context, CANOPEN_SEQUENCE);
         return;
     }
-    if (next) {
+    if (next) { /* requests of others, which seem out of order, do not prolong the transfer of one that is gone */
+        sdo->time_us = context->time_us;
         sdo->sequence++;
         if (last) {
             memcpy(sdo->last, segment + 1, sizeof sdo->last);

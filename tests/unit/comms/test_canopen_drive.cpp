@@ -265,6 +265,39 @@ TEST_F(CanopenDrive, a_load_that_turns_the_rotor_does_not_keep_a_stop_from_endin
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+TEST_F(CanopenDrive, a_command_repeated_each_ms_does_not_keep_a_stop_from_ending) {
+    write(0x605B, 0, 1);
+    for (const auto &[word, to] : {std::pair{SHUTDOWN, CANOPEN_READY_TO_SWITCH_ON}, {SWITCH_ON, CANOPEN_SWITCHED_ON}}) {
+        for (int32_t speed : {0, 300000}) { // at rest, and turned by a load
+            go(CANOPEN_SWITCHED_ON);
+            control(ENABLE);
+            values.motion.speed_rpm = speed;
+            cycle(2);
+            for (unsigned ms = 0; ms < 1500; ms++) {
+                receive(0x200 + NODE, {uint8_t(word), 0});
+                cycle();
+            }
+            expect_state(to, "a master that sends its controlword in each cycle");
+            EXPECT_EQ(command.request, COMMAND_OFF);
+            values.motion.speed_rpm = 0;
+        }
+    }
+}
+
+TEST_F(CanopenDrive, another_command_in_a_stop_is_obeyed) {
+    write(0x605B, 0, 1);
+    go(CANOPEN_SWITCHED_ON);
+    control(ENABLE);
+    values.motion.speed_rpm = 300000;
+    cycle(2);
+    control(SWITCH_ON);
+    cycle(5);
+    control(SHUTDOWN);
+    values.motion.speed_rpm = 0;
+    cycle(400);
+    expect_state(CANOPEN_READY_TO_SWITCH_ON, "the later one");
+}
+
 TEST_F(CanopenDrive, quick_stop_options) {
     write(0x605A, 0, 0);
     enable();
@@ -334,6 +367,30 @@ TEST_F(CanopenDrive, silence_without_any_supervision_is_a_lost_master) {
     EXPECT_NE(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
     EXPECT_EQ(write(0x2F01, 0, 0), 0x06090032u) << "cannot be switched off";
     EXPECT_EQ(write(0x6007, 0, 0), 0x06090032u) << "nor the reaction";
+}
+
+TEST_F(CanopenDrive, silence_in_a_quick_stop_that_stays_opens_the_switches) {
+    write(0x605A, 0, 6);
+    enable();
+    control(QUICK_STOP);
+    cycle(1900);
+    expect_state(CANOPEN_QUICK_STOP_ACTIVE, "option 6 stays");
+    EXPECT_EQ(command.request, COMMAND_RUN);
+    cycle(300);
+    expect_state(CANOPEN_SWITCH_ON_DISABLED, "the master is lost");
+    EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(CanopenDrive, a_consumer_without_node_or_time_is_none_and_a_node_is_watched_once) {
+    EXPECT_EQ(write(0x1016, 1, 0x7F << 16 | 100), 0u);
+    EXPECT_EQ(write(0x1016, 2, 0x7F << 16 | 200), 0x06040043u) << "the same node";
+    EXPECT_EQ(write(0x1016, 1, 0x7F << 16 | 200), 0u) << "its own entry";
+    EXPECT_EQ(write(0x1016, 1, 0x7F << 16), 0u) << "no time: not used";
+    EXPECT_EQ(write(0x1016, 2, 100), 0u) << "no node: not used";
+    enable();
+    receive(0x77F, {5});
+    cycle(2100);
+    EXPECT_NE(canopen.drive.state, CANOPEN_OPERATION_ENABLED) << "an entry that is not used replaces no supervision";
 }
 
 TEST_F(CanopenDrive, other_losses_of_the_master) {

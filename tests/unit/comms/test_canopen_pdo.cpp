@@ -83,7 +83,7 @@ TEST_F(CanopenPdo, mapping_is_changed_by_the_procedure_of_the_standard_alone) {
     EXPECT_EQ(write(0x1600, 2, 0x60400010), 0u);
     EXPECT_EQ(write(0x1600, 0, 2), 0x06040043u) << "the controlword twice";
     for (int32_t id : {0x0, 0x7F, 0x80, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x701, 0x7FF}) {
-        EXPECT_EQ(write(0x1800, 1, int32_t(0x80000000u) | id), 0x06090030u) << id;
+        EXPECT_EQ(write(0x1800, 1, id), 0x06090030u) << id;
     }
     EXPECT_EQ(write(0x1800, 1, int32_t(0x20000181)), 0x06090030u) << "29 bits";
     EXPECT_EQ(write(0x1800, 2, 241), 0x06090030u);
@@ -178,6 +178,50 @@ TEST_F(CanopenPdo, the_controlword_of_a_frame_finds_its_mode_and_reference) {
     EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
     receive(0x400 + NODE, {0, 0, 9, 1, 0, 0, 0, 0});
     EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "long: its begin counts";
+}
+
+TEST_F(CanopenPdo, a_controlword_finds_the_references_of_its_sync) {
+    canopen_object_t target, word;
+    canopen_find(0x607A, 0, &target);
+    canopen_find(0x6040, 0, &word);
+    EXPECT_EQ(map(0x1400, 0x1600, {word}, 1), 0u);
+    EXPECT_EQ(map(0x1401, 0x1601, {target}, 1), 0u);
+    values.status.controller = DRIVE_CONTROLLER_SALIENT;
+    cycle();
+    EXPECT_EQ(write(0x6060, 0, 1), 0u);
+    enable();
+    receive(0x200 + NODE, {0x1F, 0}); // new set-point
+    receive(0x300 + NODE, {0, 0, 2, 0});
+    EXPECT_FALSE(canopen.position.moving) << "not before the SYNC";
+    receive(0x80, {});
+    EXPECT_TRUE(canopen.position.moving);
+    EXPECT_EQ(canopen.position.move.target, POSITION_ONE_REV) << "not the target before";
+}
+
+TEST_F(CanopenPdo, a_pdo_without_a_mapping_is_none) {
+    EXPECT_EQ(map(0x1800, 0x1A00, {}), 0u);
+    EXPECT_EQ(map(0x1400, 0x1600, {}), 0u);
+    EXPECT_EQ(map(0x1801, 0x1A01, {}, 1), 0u);
+    operational();
+    cycle();
+    receive(0x80, {});
+    receive(0x200 + NODE, {6, 0});
+    cycle(5);
+    for (const sent_t &frame : sent()) {
+        EXPECT_NE(frame.identifier, 0x180u + NODE);
+        EXPECT_NE(frame.identifier, 0x280u + NODE);
+        EXPECT_NE(frame.identifier, 0x80u + NODE) << "nor an emergency for its length";
+    }
+}
+
+TEST_F(CanopenPdo, a_pdo_that_is_not_valid_has_any_identifier) {
+    EXPECT_EQ(write(0x1400, 1, int32_t(0x80000000u)), 0u);
+    EXPECT_EQ(read(0x1400, 1), 0x80000000u);
+    EXPECT_EQ(write(0x1400, 1, 0), 0x06090030u) << "valid with the identifier of NMT";
+    EXPECT_EQ(write(0x1400, 1, 0x601), 0x06090030u);
+    EXPECT_EQ(write(0x1400, 1, int32_t(0xA0000000u)), 0x06090030u) << "29 bits";
+    EXPECT_EQ(write(0x1400, 1, 0x200 + NODE), 0u);
+    EXPECT_EQ(write(0x1800, 1, int32_t(0x80000000u)), 0u);
 }
 
 TEST_F(CanopenPdo, transmission_types_and_timers) {

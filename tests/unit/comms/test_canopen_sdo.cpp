@@ -268,6 +268,16 @@ TEST_F(CanopenSdo, a_client_that_is_gone_blocks_no_other) {
     EXPECT_EQ(sdo(head(0x40, 0x1000, 0)), head(0x43, 0x1000, 0, 0x00020192));
 }
 
+TEST_F(CanopenSdo, a_client_that_is_gone_blocks_none_that_tries_again_and_again) {
+    EXPECT_EQ(sdo(head(0xC6, 0x60FF, 0, 4))[0], 0xA4);
+    bytes_t response;
+    for (unsigned trial = 0; trial < 5; trial++) {
+        response = sdo(head(0x40, 0x1000, 0));
+        time_us += 300000;
+    }
+    EXPECT_EQ(response, head(0x43, 0x1000, 0, 0x00020192));
+}
+
 TEST_F(CanopenSdo, parameters_are_stored_and_defaults_restored_with_the_node_kept) {
     EXPECT_EQ(write(0x2000 + PARAMETER_OVER_SPEED_RPM, 0, 2222), 0u);
     EXPECT_EQ(write(0x1010, 1, 0x65766173), 0u);
