@@ -25,6 +25,21 @@
 /* Windows after a torque at its limit that still belong to the transient. */
 #define TRANSIENT_WINDOWS 8
 
+/* The rest and its reciprocal, 1/2..2. */
+#define REST_BITS 14
+#define REST_ONE (1 << REST_BITS)
+#define REST_LITTLE (REST_ONE / 4)
+
+/* Beyond them the shift is another one. */
+#define REST_SMALL (REST_ONE / 8 * 5)
+#define REST_LARGE (REST_ONE / 4 * 7)
+
+/* Part of the least variance that a straight regression needs. */
+#define STRAIGHT_VARIANCE_SHIFT 2
+
+/* Longer windows, of coarse encoders, are means over more than a ramp of an acceleration. */
+#define FINE_RATE_MIN_HZ 300u
+
 /* Least standard deviation of the torque, as a part of the largest torque. */
 #define DEVIATION_SHARE 8
 
@@ -55,6 +70,7 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings) {
         .variance_min_q14 = fixed_multiply_high(deviation_q23, deviation_q23),
         .window_shift = shift,
         .torque_shift = 2 * shift + 2,
+        .fine = update_rate_hz >> shift >= FINE_RATE_MIN_HZ,
         .reaching_gain_q24 = settings->reaching_gain_q24,
         .rate_q8 = settings->rate_q8,
     };
@@ -76,12 +92,30 @@ static void limit_shift(inertia_t *inertia) {
     }
 }
 
-static void set_laws(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
+static void set_laws(inertia_t *inertia) {
     inertia->laws = (inertia_laws_t){
-        .observer = load_observer_inertia(model, inertia->shift),
-        .reaching_gain_q24 = scaled(parameters->reaching_gain_q24, inertia->shift),
-        .rate_q8 = scaled(parameters->rate_q8, inertia->shift),
+        .observer = load_observer_inertia(&inertia->base.observer, inertia->shift),
+        .reaching_gain_q24 = scaled(inertia->base.reaching_gain_q24, inertia->shift),
+        .rate_q8 = scaled(inertia->base.rate_q8, inertia->shift),
     };
+}
+
+static int32_t limited_rest(int32_t rest_q14) {
+    return fixed_clamp(rest_q14, REST_ONE / 2, REST_ONE * 2);
+}
+
+static int32_t by_rest(int32_t value, int32_t rest_q14) {
+    return fixed_multiply(value, rest_q14, REST_BITS);
+}
+
+/* Laws of J0 / g; its bits for a rest of 1. */
+COLD NOINLINE static void set_base(const inertia_parameters_t *parameters, const load_observer_model_t *model,
+                                   inertia_t *inertia) {
+    const int32_t inverse_q14 = limited_rest(inertia->inverse_rest_q14);
+    inertia->base.observer.acceleration_q32 = by_rest(model->acceleration_q32, limited_rest(inertia->rest_q14));
+    inertia->base.reaching_gain_q24 = by_rest(parameters->reaching_gain_q24, inverse_q14);
+    inertia->base.rate_q8 = by_rest(parameters->rate_q8, inverse_q14);
+    inertia->ratio_q14 = scaled(inverse_q14, inertia->shift);
 }
 
 void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
@@ -96,12 +130,18 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
     inertia->torque_mean_q23 = inertia->acceleration_mean_q23 = 0;
     inertia->torque_variance_q14 = inertia->acceleration_variance_q14 = inertia->covariance_q14 = 0;
     limit_shift(inertia);
-    set_laws(parameters, model, inertia);
+    inertia->base = (inertia_base_t){*model, parameters->reaching_gain_q24, parameters->rate_q8};
+    inertia->rest_q14 = inertia->inverse_rest_q14 = REST_ONE;
+    inertia->ratio_q14 = scaled(REST_ONE, inertia->shift);
+    inertia->refined_shift = inertia->shift;
+    inertia->refined_windows = 0;
+    set_laws(inertia);
 }
 
 COLD void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
     limit_shift(inertia);
-    set_laws(parameters, model, inertia);
+    set_base(parameters, model, inertia);
+    set_laws(inertia);
 }
 
 /* Ends a window. */
@@ -165,8 +205,8 @@ static void judge(const inertia_parameters_t *parameters, inertia_t *inertia, ui
     }
 }
 
-void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
-                  uint32_t angle, int32_t torque_q24, bool limited, bool approaching) {
+void inertia_step(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t angle, int32_t torque_q24,
+                  bool limited, bool approaching) {
     /* The sum of sums takes the sum of the middle of the update, to which the mean torque belongs. */
     const uint32_t half_q23 = (uint32_t)(torque_q24 >> parameters->torque_shift);
     inertia->sum_q23 += half_q23;
@@ -186,6 +226,74 @@ void inertia_step(const inertia_parameters_t *parameters, const load_observer_mo
     } else if (update == 1 && windows > 1) { /* the rotation before the first window is unknown */
         limit_shift(inertia);
         judge(parameters, inertia, windows);
-        set_laws(parameters, model, inertia);
+        set_laws(inertia);
     }
+}
+
+static void follow_rest(inertia_t *inertia) {
+    const int32_t present = fixed_max(scaled(inertia->torque_variance_q14, -inertia->shift), 1);
+    const int64_t wanted_q14 = (int64_t)inertia->covariance_q14 * REST_ONE;
+    const int64_t missing_q14 = wanted_q14 - fixed_product(present, inertia->rest_q14);
+    const unsigned bits = 32u - (unsigned)__builtin_clz((uint32_t)present);
+    const int32_t step_q14 = fixed_saturate(missing_q14 >> bits);
+    const bool little = fixed_abs(step_q14) < REST_LITTLE;
+    const int32_t followed_q14 = fixed_add(inertia->rest_q14, little ? step_q14 / 4 : step_q14);
+    int32_t rest_q14 = fixed_clamp(followed_q14, REST_ONE / 8, REST_ONE * 8);
+    UNROLL(3)
+    for (unsigned i = 0; i < 3; i++) {
+        if (rest_q14 < REST_SMALL && inertia->shift > SHIFT_MIN) {
+            inertia->shift--;
+            rest_q14 *= 2;
+        } else if (rest_q14 > REST_LARGE && inertia->shift < SHIFT_MAX) {
+            inertia->shift++;
+            rest_q14 /= 2;
+        }
+    }
+    inertia->rest_q14 = limited_rest(rest_q14);
+    inertia->refined_shift = inertia->shift;
+}
+
+/* The rest belongs to the present shift. */
+static void move_rest(inertia_t *inertia) {
+    const int32_t change = fixed_clamp(inertia->shift - inertia->refined_shift, -1, 1);
+    const int32_t rest_q14 = limited_rest(inertia->rest_q14), inverse_q14 = limited_rest(inertia->inverse_rest_q14);
+    inertia->rest_q14 = limited_rest(scaled(rest_q14, change));
+    inertia->inverse_rest_q14 = limited_rest(scaled(inverse_q14, -change));
+    inertia->refined_shift = inertia->shift;
+}
+
+static bool is_straight(const inertia_parameters_t *parameters, const inertia_t *inertia) {
+    const int32_t variance = inertia->torque_variance_q14, covariance = inertia->covariance_q14;
+    const int64_t product = fixed_product(variance, inertia->acceleration_variance_q14);
+    return variance >= parameters->variance_min_q14 >> STRAIGHT_VARIANCE_SHIFT && covariance >= variance / 8 &&
+           fixed_product(covariance, covariance) >= product - (product >> 5);
+}
+
+COLD NOINLINE void inertia_refine(const inertia_parameters_t *parameters, const load_observer_model_t *model,
+                                  inertia_t *inertia) {
+    const uint32_t windows = inertia->updates >> parameters->window_shift;
+    if (windows == inertia->refined_windows && inertia->shift == inertia->refined_shift) {
+        return;
+    }
+    limit_shift(inertia);
+    if (!parameters->fine) {
+        inertia->refined_windows = windows;
+        inertia->refined_shift = inertia->shift;
+        inertia->ratio_q14 = scaled(REST_ONE, inertia->shift);
+        return;
+    }
+    move_rest(inertia);
+    inertia->refined_windows = windows;
+    if (inertia->transient_windows > 0 && windows > START_WINDOWS + REGRESSION_WINDOWS &&
+        is_straight(parameters, inertia)) {
+        follow_rest(inertia);
+    }
+    UNROLL(3)
+    for (unsigned i = 0; i < 3; i++) {
+        const int32_t inverse_q14 = inertia->inverse_rest_q14;
+        const int32_t missing_q14 = REST_ONE - by_rest(inertia->rest_q14, inverse_q14);
+        inertia->inverse_rest_q14 = limited_rest(inverse_q14 + by_rest(inverse_q14, missing_q14));
+    }
+    set_base(parameters, model, inertia);
+    set_laws(inertia);
 }

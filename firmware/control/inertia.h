@@ -21,6 +21,12 @@
  * The result is the shift k of J0 / J = 2^k, within -2..2: J = J0 / 5 and J = 5 J0 then differ from 2^-k J0 by a
  * quarter. It changes by one at a time, when the regression is off by more than 1.75 or 1 / 1.6. A machine as its
  * parameters state stays at k = 0, where the laws are the parameters'.
+ *
+ * A position is followed by a feed-forward in proportion to the inertia, for which a power of two is not enough. There
+ * the rest g = J0 / (J 2^k), within 1/2..2, follows the regression where it is straight, cov(T, A)^2 > 31/32 var(T)
+ * var(A), in each window by half or more of what is missing; by an eighth or more when that is less than a quarter, for
+ * the counts of a heavy shaft are noise. A quarter of the variance is enough. A rest beyond 5/8..7/4 changes k. The
+ * reciprocal comes by Newton's method. Each run begins with a rest of 1; with coarse encoders it stays.
  */
 #ifndef CONTROL_INERTIA_H
 #define CONTROL_INERTIA_H
@@ -44,12 +50,24 @@ typedef struct {
     unsigned torque_shift;     /* from N m, Q7.24, to half of T / 4^window_shift, Q8.23 */
     int32_t reaching_gain_q24; /* of J0 */
     int32_t rate_q8;           /* of J0 */
+    uint32_t fine;             /* the windows are short enough for the rest */
 } inertia_parameters_t;
+
+/* Laws of the inertia J0 / g. */
+typedef struct {
+    load_observer_model_t observer;
+    int32_t reaching_gain_q24, rate_q8;
+} inertia_base_t;
 
 typedef struct {
     int32_t gain_q8; /* of the parameters with which the shift has been identified */
     int32_t shift;   /* k */
+    inertia_base_t base;
     inertia_laws_t laws;
+    int32_t rest_q14, inverse_rest_q14;   /* g and 1 / g, 2^13..2^15 */
+    int32_t ratio_q14;                    /* J / J0, with which a position is followed */
+    int32_t refined_shift;                /* k to which the rest belongs */
+    uint32_t refined_windows;             /* of which the rest has been found */
     uint32_t transient_windows;           /* left of the transient */
     uint32_t updates;                     /* since the start of the run */
     uint32_t sum_q23;                     /* of T / 4^window_shift, wraps */
@@ -83,7 +101,10 @@ void inertia_tune(const inertia_parameters_t *parameters, const load_observer_mo
 /* One update of a run: rotor angle in 2^-32 electrical rev, machine torque in N m, Q7.24, in the mean since the last
  * one: a torque that swings within it would not show in a sample. limited: its reference is at
  * a limit. approaching: the speed approaches a changed reference. */
-void inertia_step(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
-                  uint32_t angle, int32_t torque_q24, bool limited, bool approaching);
+void inertia_step(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t angle, int32_t torque_q24,
+                  bool limited, bool approaching);
+
+/* While a position is followed, in each period: the rest, and laws with it, once in a window. */
+void inertia_refine(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
 
 #endif

@@ -225,7 +225,8 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
         const bool positions = command->mode == DRIVE_MODE_POSITION;
         position_command_t position;
         if (positions) {
-            position = position_command(&drive->control_parameters.position, &command->position);
+            position = position_command(&drive->control_parameters.position, &command->position,
+                                        drive->control.deferred.inertia.ratio_q14);
             if (position.set_point.homing >= POSITION_HOMING_METHODS) {
                 position.set_point.homing = (position_homing_t)drive->parameters.values[PARAMETER_HOMING_METHOD];
             }

@@ -266,10 +266,10 @@ static void average_torque(deferred_t *deferred, const deferred_input_t *input) 
  * position reference which accelerates. The next mean torque begins. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
-    inertia_step(
-        &parameters->inertia, &parameters->observer, &deferred->inertia, input->electrical, deferred->mean_torque_q24,
-        deferred->follows_position ? deferred->accelerates : at_torque_limit(deferred, input->torque_reference_q24),
-        deferred->approaches_reference);
+    inertia_step(&parameters->inertia, &deferred->inertia, input->electrical, deferred->mean_torque_q24,
+                 deferred->follows_position ? deferred->accelerates
+                                            : at_torque_limit(deferred, input->torque_reference_q24),
+                 deferred->approaches_reference);
     deferred->mean_torque_q24 = 0;
 }
 

@@ -13,12 +13,6 @@ static int32_t torque_limit_q24(const control_parameters_t *parameters, const co
                                                  : limit_q24;
 }
 
-/* For the identified inertia, J 2^-k. */
-static int32_t for_inertia_q24(const deferred_t *deferred, int32_t torque_q24) {
-    const int32_t k = deferred->inertia.laws.observer.load_shift - 2;
-    return k < 0 ? fixed_saturate((int64_t)torque_q24 * (1 << fixed_min(-k, 8))) : torque_q24 >> fixed_min(k, 31);
-}
-
 NOINLINE static void control_position(const control_parameters_t *parameters, control_state_t *state,
                                       const deferred_input_t *input, const position_sample_t *sample,
                                       deferred_results_t *results) {
@@ -33,8 +27,8 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
     deferred->follows_position = true;
     deferred->accelerates = fixed_abs(output.torque_q24) >= parameters->conduction.torque_max_q24 / ACCELERATION_SHARE;
     speed_control_position(parameters, deferred, input, &command, limit_q24, results);
-    results->speed.speed_law_torque_q24 =
-        fixed_add(results->speed.speed_law_torque_q24, for_inertia_q24(deferred, output.torque_q24));
+    results->speed.speed_law_torque_q24 = fixed_add(results->speed.speed_law_torque_q24,
+                                                    fixed_multiply(output.torque_q24, deferred->inertia.ratio_q14, 14));
 }
 
 /* Step of position mode: with its sample, which the other modes need not. False, and nothing is done, while the drive
@@ -57,6 +51,7 @@ NOINLINE static bool begin_step(const control_parameters_t *parameters, control_
     };
     position_status_t *status = &state->position.status;
     status->active = status->active && state->deferred.follows_position; /* else it begins */
+    inertia_refine(&parameters->inertia, &parameters->observer, &state->deferred.inertia);
     control_position(parameters, state, input, &sample, results);
     return true;
 }

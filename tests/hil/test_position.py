@@ -100,6 +100,22 @@ def test_a_cyclic_sine_is_followed_a_cycle_later(make_bench, cycle_ms):
     assert np.abs(angle[late] - expected).max() < 0.12
 
 
+@pytest.mark.parametrize("inertia_gain", [0.3, 2.0, 5.0])
+def test_an_inertia_far_from_its_parameter_is_known_within_the_first_move(make_bench, inertia_gain):
+    bench = running(make_bench)
+    bench.rig.inertia_gain = inertia_gain
+    for target_deg in (90, 1, -200):
+        before_deg = angle_deg(bench)[0][-1] - angle_deg(bench)[0][0]
+        begin_s = bench.time_s
+        move(bench, target_deg, timeout_s=0.4)
+        bench.run_for(0.05)
+        angle, time_s = angle_deg(bench)
+        beyond = (angle - angle[0] - target_deg)[time_s >= begin_s] * math.copysign(1, target_deg - before_deg)
+        assert beyond.max() < 3 * COUNT_DEG
+        assert abs(beyond[-1]) < COUNT_DEG
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+
+
 def test_a_client_that_ceases_is_a_stop_and_then_no_torque(make_bench):
     bench = running(make_bench)
     bench.drive.parameters["position_cycle_ms"] = 4

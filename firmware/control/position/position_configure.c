@@ -9,6 +9,10 @@
 #define PER_RPM_S INT64_C(4691250)
 #define PER_RPM_S2 INT64_C(4691)
 
+/* Identified inertia by the parameter's, Q14: 9/8 and 8. */
+#define RATIO_LARGE_Q14 (9 << 11)
+#define RATIO_MAX_Q14 (8 << 14)
+
 #define REV (INT64_C(1) << PROFILE_FRACTION_BITS)
 
 COLD NOINLINE static int64_t saturated(int64_t value, int64_t factor) {
@@ -34,14 +38,18 @@ static int64_t per_speed_q16(const position_settings_t *settings) {
     return (int64_t)settings->angle_step_q32 * (settings->control_rate_hz / PROFILE_TICK_HZ);
 }
 
-COLD static profile_limits_t limits_from(const position_settings_t *settings) {
-    const unsigned exponent = settings->speed_exponent;
-    const int64_t per_q16 = per_speed_q16(settings);
-    const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
-    const int64_t speed_max = saturated(settings->speed_max_q22 >> 4, per_q16) >> 12;
+/* Acceleration by the largest torque. */
+COLD NOINLINE static int64_t acceleration_by_torque(const position_settings_t *settings) {
     /* Change of the speed in a period, Q22. */
     const int64_t change_q22 = fixed_product(settings->torque_max_q24, settings->acceleration_q32) >> 32;
-    const int64_t by_torque = saturated(change_q22 * rate_per_tick, per_q16 >> 8) >> 8;
+    const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
+    return saturated(change_q22 * rate_per_tick, per_speed_q16(settings) >> 8) >> 8;
+}
+
+COLD static profile_limits_t limits_from(const position_settings_t *settings) {
+    const unsigned exponent = settings->speed_exponent;
+    const int64_t speed_max = saturated(settings->speed_max_q22 >> 4, per_speed_q16(settings)) >> 12;
+    const int64_t by_torque = acceleration_by_torque(settings);
     const int64_t speed = in_unit(settings->speed_rpm, exponent, PER_RPM_Q8) >> 8;
     const int64_t up = either(in_unit(settings->acceleration_rpm_s, exponent, PER_RPM_S), by_torque / 4 * 3);
     const int64_t down = either(in_unit(settings->deceleration_rpm_s, exponent, PER_RPM_S), up);
@@ -84,6 +92,7 @@ COLD position_parameters_t position_configure(const position_settings_t *setting
         .homing_speed = in_unit(settings->homing_speed_rpm, settings->speed_exponent, PER_RPM_Q8) >> 8,
         .homing_torque_q24 =
             settings->homing_torque_q24 > 0 ? settings->homing_torque_q24 : settings->torque_max_q24 / 4,
+        .acceleration_max = acceleration_by_torque(settings) / 4 * 3,
         .cycle = cycle_of(settings->cycle_ms),
         .limits = limits_from(settings),
     };
@@ -98,31 +107,39 @@ COLD static int64_t within(const position_parameters_t *parameters, int64_t posi
     return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->lowest, parameters->highest);
 }
 
-COLD position_command_t position_command(const position_parameters_t *parameters,
-                                         const position_set_point_t *set_point) {
+/* Acceleration by 3/4 of the largest torque, of an inertia that exceeds the parameter by more than an eighth. */
+COLD static int64_t acceleration_of_inertia(const position_parameters_t *parameters, int32_t ratio_q14) {
+    return ratio_q14 <= RATIO_LARGE_Q14 ? INT64_MAX : fixed_divide(parameters->acceleration_max, ratio_q14) << 14;
+}
+
+COLD position_command_t position_command(const position_parameters_t *parameters, const position_set_point_t *set_point,
+                                         int32_t inertia_ratio_q14) {
     position_command_t command = {
         .set_point = *set_point,
         .limits = parameters->limits,
         .cycle = set_point->cycle_ms > 0 ? cycle_of(set_point->cycle_ms) : parameters->cycle,
         .lowest = parameters->lowest,
         .highest = parameters->highest,
+        .inertia_ratio_q14 = fixed_clamp(inertia_ratio_q14, 0, RATIO_MAX_Q14),
     };
     if (set_point->bounded) {
         command.lowest = within(parameters, set_point->lowest);
         command.highest = within(parameters, set_point->highest);
     }
-    if (set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 || set_point->deceleration_rpm_s > 0 ||
-        set_point->jerk_rpm_s2 > 0) {
+    const int64_t most_acceleration = acceleration_of_inertia(parameters, command.inertia_ratio_q14);
+    if (most_acceleration < INT64_MAX || set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 ||
+        set_point->deceleration_rpm_s > 0 || set_point->jerk_rpm_s2 > 0) {
         const profile_limits_t *most = &parameters->limits;
         const unsigned exponent = parameters->speed_exponent;
         const int64_t speed = saturated(fixed_max(set_point->speed_q22, 0) >> 4, parameters->per_speed_q16) >> 12;
         const int64_t up = in_unit(set_point->acceleration_rpm_s, exponent, PER_RPM_S);
         const int64_t down = in_unit(set_point->deceleration_rpm_s, exponent, PER_RPM_S);
         const int64_t jerk = in_unit(set_point->jerk_rpm_s2, exponent, PER_RPM_S2);
-        command.limits = profile_limits(smaller(either(speed, most->speed), most->speed),
-                                        smaller(either(up, most->acceleration), most->acceleration),
-                                        smaller(either(down, most->deceleration), most->deceleration),
-                                        smaller(either(jerk, 6 * most->q), 6 * most->q));
+        const int64_t most_up = smaller(most->acceleration, most_acceleration);
+        const int64_t most_down = smaller(most->deceleration, most_acceleration);
+        command.limits = profile_limits(
+            smaller(either(speed, most->speed), most->speed), smaller(either(up, most->acceleration), most_up),
+            smaller(either(down, most->deceleration), most_down), smaller(either(jerk, 6 * most->q), 6 * most->q));
     }
     return command;
 }

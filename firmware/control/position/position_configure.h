@@ -32,6 +32,7 @@ typedef struct {
 position_parameters_t position_configure(const position_settings_t *settings);
 
 /* The set point with its limits, none beyond the parameters'. [background] */
-position_command_t position_command(const position_parameters_t *parameters, const position_set_point_t *set_point);
+position_command_t position_command(const position_parameters_t *parameters, const position_set_point_t *set_point,
+                                    int32_t inertia_ratio_q14);
 
 #endif

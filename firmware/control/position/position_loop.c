@@ -253,6 +253,17 @@ COLD NOINLINE static void check_following(const position_parameters_t *parameter
     status->in_position = arrived && error <= parameters->window && error >= -parameters->window;
 }
 
+/* An inertia has become known, larger than the one of the limits so far, with which the reference has left the rotor
+ * behind: it goes on from there, with limits that the torque can keep. */
+COLD NOINLINE static void follow_inertia(position_t *position, const position_command_t *command,
+                                         const position_sample_t *sample) {
+    const int32_t known_q14 = position->inertia_ratio_q14, ratio_q14 = command->inertia_ratio_q14;
+    if (ratio_q14 > known_q14 + known_q14 / 8 && sample->at_torque_limit && position->homing == POSITION_HOMING_IDLE) {
+        begin_here(position, sample);
+    }
+    position->inertia_ratio_q14 = ratio_q14;
+}
+
 /* The order decides where the reference goes from this tick on. */
 COLD NOINLINE static void decide(position_t *position, const position_command_t *command,
                                  const position_sample_t *sample) {
@@ -297,6 +308,7 @@ COLD NOINLINE static void tick(const position_parameters_t *parameters, position
         profile_tick(profile);
     }
     check_following(parameters, position, sample);
+    follow_inertia(position, command, sample);
     decide(position, command, sample);
     profile->end = profile_advance(&profile->start, profile->q);
 }

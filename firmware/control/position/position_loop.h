@@ -56,7 +56,8 @@ typedef struct {
     int64_t lowest, highest;   /* software end stops */
     int64_t window;
     int64_t following_error;
-    int64_t homing_speed; /* 2^-48 rev per tick */
+    int64_t homing_speed;     /* 2^-48 rev per tick */
+    int64_t acceleration_max; /* of the inertia of the parameter by 3/4 of the largest torque */
     int32_t homing_torque_q24;
     position_cycle_t cycle;  /* of a set point without its own */
     profile_limits_t limits; /* likewise */
@@ -67,7 +68,8 @@ typedef struct {
     position_set_point_t set_point;
     profile_limits_t limits;
     position_cycle_t cycle;
-    int64_t lowest, highest; /* software end stops, 2^-48 rev */
+    int64_t lowest, highest;   /* software end stops, 2^-48 rev */
+    int32_t inertia_ratio_q14; /* identified inertia by the parameter's, of which the limits are, at most 8 */
 } position_command_t;
 
 typedef enum { POSITION_HOMING_IDLE, POSITION_HOMING_SEEKS, POSITION_HOMING_RETURNS } position_homing_step_t;
@@ -90,7 +92,8 @@ typedef struct {
     uint32_t cubic_ticks;  /* left of the cubic */
     position_homing_step_t homing;
     uint32_t blocked_ticks;
-    int64_t turn; /* of the encoder, when the homing began to seek */
+    int64_t turn;              /* of the encoder, when the homing began to seek */
+    int32_t inertia_ratio_q14; /* of the command in the last tick */
     position_status_t status;
 } position_t;
 

@@ -40,7 +40,7 @@ using torque_t = std::function<double(double)>;
 // Shift after half a second of a shaft of `gain` times the inertia J0, whose speed has settled after settled_s. last:
 // state of an earlier run, and after this one.
 int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &torque, const torque_t &load,
-                    inertia_t *last = nullptr, double settled_s = 1.0) {
+                    inertia_t *last = nullptr, double settled_s = 1.0, bool fine = false) {
     const inertia_parameters_t parameters = inertia_configure(&of);
     inertia_t inertia = last != nullptr ? *last : inertia_t{};
     const double step_s = double(of.periods_per_update) / of.control_rate_hz;
@@ -49,8 +49,11 @@ int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &t
     inertia_restart(&parameters, &MODEL, &inertia, angle_from_rev(rev) * POLES);
     for (double t = 0.0; t < 0.5; t += step_s) {
         const uint32_t angle = angle_from_rev(std::floor(rev * counts) / counts) * POLES;
-        inertia_step(&parameters, &MODEL, &inertia, angle, to_fixed(0.5 * (torque(t - step_s) + torque(t)), Q24),
+        inertia_step(&parameters, &inertia, angle, to_fixed(0.5 * (torque(t - step_s) + torque(t)), Q24),
                      torque(t) >= TORQUE_MAX, t < settled_s);
+        if (fine) {
+            inertia_refine(&parameters, &MODEL, &inertia);
+        }
         const double mean_Nm = 0.5 * (torque(t) - load(t) + torque(t + step_s) - load(t + step_s));
         const double change = mean_Nm / (gain * J0 * 2.0 * PI) * step_s;
         rev += (rev_s + 0.5 * change) * step_s;
@@ -246,11 +249,78 @@ TEST(Inertia, a_shift_that_has_changed_in_memory_gives_laws_within_the_limits) {
             if (step == 20) {
                 inertia.shift = int32_t(UINT32_C(1) << bit);
             }
-            inertia_step(&parameters, &MODEL, &inertia, 0, 0, true, true);
+            inertia_step(&parameters, &inertia, 0, 0, true, true);
         }
         EXPECT_GE(inertia.laws.observer.load_shift, 0) << bit;
         EXPECT_LE(inertia.laws.observer.load_shift, 4) << bit;
         EXPECT_EQ(inertia.shift, bit < 2 ? 1 << bit : 0);
+    }
+}
+
+TEST(Inertia, a_position_is_followed_with_the_inertia_within_three_percent) {
+    const torque_t swing = [](double t) {
+        return t < 0.1 ? 0.0 : t < 0.13 ? TORQUE_MAX : t < 0.16 ? -TORQUE_MAX : 0.0;
+    };
+    const torque_t none = [](double) { return 0.0; };
+    for (const double gain : {0.2, 0.3, 0.5, 0.6, 0.8, 1.0, 1.3, 1.9, 3.0, 5.0}) {
+        for (const torque_t &load : {none, torque_t(constant_8)}) {
+            inertia_t inertia{};
+            const torque_t torque = [&](double t) { return swing(t) + load(t); };
+            shift_after(settings(), gain, torque, load, &inertia, 1.0, true);
+            EXPECT_NEAR(std::ldexp(inertia.ratio_q14, -14), gain, 0.03 * gain);
+            EXPECT_NEAR(inertia.laws.reaching_gain_q24,
+                        std::ldexp(inertia.ratio_q14, -14) * to_fixed(REACHING_GAIN, Q24), 2000.0);
+            EXPECT_NEAR(inertia.laws.rate_q8, std::ldexp(inertia.ratio_q14, -14) * RATE_Q8, 8.0);
+            EXPECT_NEAR(inertia.laws.observer.acceleration_q32 * std::ldexp(inertia.ratio_q14, -14),
+                        MODEL.acceleration_q32, 0.002 * MODEL.acceleration_q32);
+        }
+    }
+}
+
+TEST(Inertia, a_coarse_encoder_shows_the_power_of_two_alone) {
+    const torque_t slow = [](double t) { return t > 0.1 && t < 0.2 ? TORQUE_MAX : 0.0; };
+    for (const auto &[bits, fine] : {std::pair{17u, true}, {14u, true}, {10u, false}, {9u, false}}) {
+        inertia_t inertia{};
+        shift_after(
+            settings(bits), 0.3, slow, [](double) { return 0.0; }, &inertia, 1.0, true);
+        EXPECT_EQ(inertia.rest_q14 != 1 << 14, fine) << bits;
+        EXPECT_EQ(inertia.ratio_q14 == std::ldexp(1 << 14, -inertia.shift), !fine)
+            << bits << ", " << inertia.ratio_q14 << ", " << inertia.shift;
+    }
+}
+
+TEST(Inertia, a_run_begins_with_the_power_of_two_alone) {
+    const inertia_settings_t of = settings();
+    const inertia_parameters_t parameters = inertia_configure(&of);
+    inertia_t inertia{}, coarse{};
+    shift_after(of, 0.3, start, constant_8, &coarse);
+    shift_after(of, 0.3, start, constant_8, &inertia, 1.0, true);
+    EXPECT_NE(inertia.rest_q14, 1 << 14);
+    EXPECT_NE(inertia.laws.reaching_gain_q24, coarse.laws.reaching_gain_q24);
+    const int32_t gain_q24 = inertia.laws.reaching_gain_q24;
+    inertia_tune(&parameters, &MODEL, &inertia);
+    EXPECT_EQ(inertia.laws.reaching_gain_q24, gain_q24) << "parameters that are tuned in a run leave the inertia";
+    inertia_restart(&parameters, &MODEL, &inertia, 0);
+    EXPECT_EQ(inertia.laws.reaching_gain_q24, coarse.laws.reaching_gain_q24);
+    EXPECT_EQ(inertia.laws.observer.acceleration_q32, coarse.laws.observer.acceleration_q32);
+    EXPECT_EQ(inertia.ratio_q14, (1 << 14) >> coarse.shift);
+}
+
+TEST(Inertia, a_rest_that_has_changed_in_memory_gives_laws_within_the_limits) {
+    const inertia_settings_t of = settings();
+    const inertia_parameters_t parameters = inertia_configure(&of);
+    for (unsigned bit = 0; bit < 64; bit++) {
+        inertia_t inertia{};
+        inertia_restart(&parameters, &MODEL, &inertia, 0);
+        for (unsigned step = 0; step < 8u << parameters.window_shift; step++) {
+            if (step == 40) {
+                (bit < 32 ? inertia.rest_q14 : inertia.inverse_rest_q14) ^= int32_t(UINT32_C(1) << bit % 32);
+            }
+            inertia_step(&parameters, &inertia, 0, 0, true, true);
+            inertia_refine(&parameters, &MODEL, &inertia);
+            EXPECT_GE(inertia.ratio_q14, 1 << 13) << bit;
+            EXPECT_LE(inertia.ratio_q14, 1 << 15) << bit;
+        }
     }
 }
 
