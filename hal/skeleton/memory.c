@@ -1,26 +1,8 @@
-/* Memory: program and stack for the self-test, pages for the parameters, random numbers. */
-#include "hal_memory.h"
+/* Memory: pages for the parameters, random numbers. Program and stack for the self-test are in ../qemu/memory.c for
+ * images that ../qemu/sections.ld places; a port with another linker script has a hal_memory of its own. */
 #include "hal_nvm.h"
 #include "hal_random.h"
 #include "skeleton/board.h"
-
-extern const uint32_t code_start[];       /* symbols of the linker script */
-extern uint32_t stack_end[], stack_top[]; /* likewise */
-
-/* After the code; salient.generate.code_check fills in both. */
-__attribute__((section(".code_check"), used)) const volatile uint32_t code_check[2] = {0, 0};
-
-/* As it is for a linker script with these symbols. */
-void hal_memory(const hal_t *hal, hal_memory_t *memory) {
-    (void)hal;
-    *memory = (hal_memory_t){
-        .code = code_start,
-        .code_words = code_check[0],
-        .code_crc = code_check[1],
-        .stack = stack_end,
-        .stack_words = (uint32_t)(stack_top - stack_end),
-    };
-}
 
 /* FILL IN: a word; errors of the memory's error correction are dealt with. */
 uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {

@@ -14,20 +14,6 @@ extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], s
 hal_t board;
 static drive_t drive;
 
-/* After the code; salient.generate.code_check fills in both. */
-__attribute__((section(".code_check"), used)) const volatile uint32_t code_check[2] = {0, 0};
-
-void hal_memory(const hal_t *hal, hal_memory_t *memory) {
-    (void)hal;
-    *memory = (hal_memory_t){
-        .code = code_start,
-        .code_words = code_check[0],
-        .code_crc = code_check[1],
-        .stack = stack_end,
-        .stack_words = (uint32_t)(stack_top - stack_end),
-    };
-}
-
 static void control_handler(void) {
     if (control_begin(&board)) {
         drive_control_interrupt(&drive, &board);

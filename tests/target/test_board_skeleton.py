@@ -22,7 +22,8 @@ def functions_of_the_interface() -> set[str]:
 
 
 def sources(port: str) -> str:
-    return "\n".join(path.read_text() for path in sorted((HAL / port).glob("*.c")))
+    shared = HAL / "qemu" / "memory.c"  # of all images with its linker script
+    return "\n".join(path.read_text() for path in (*sorted((HAL / port).glob("*.c")), shared))
 
 
 @pytest.mark.parametrize("port", PORTS)
