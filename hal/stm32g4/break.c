@@ -111,11 +111,12 @@ uint32_t break_causes(void) {
     return causes;
 }
 
-/* A cause that is still there sets its flag again. */
+/* A cause that is still there sets its flag again; the edge of a line that is still low would not come again. */
 void break_clear(void) {
+    const uint32_t high = (GPIO_IDR(GPIOB_BASE) & (LINE_STO_1 | LINE_STO_2)) | (GPIO_IDR(GPIOC_BASE) & LINE_FAULT);
     TIM_CNT(TIM3_BASE) = 0;
     TIM_SR(TIM3_BASE) = ~(TIM_SR_CC1IF | TIM_SR_CC2IF);
-    EXTI_PR1 = LINES;
+    EXTI_PR1 = high;
     TIM_SR(TIM1_BASE) = ~(TIM_SR_BIF | TIM_SR_B2IF | TIM_SR_SBIF);
     TIM_SR(TIM8_BASE) = ~(TIM_SR_BIF | TIM_SR_B2IF | TIM_SR_SBIF);
 }
