@@ -3,6 +3,7 @@
  * Converters ADC1 to ADC5 (RM0440, 21): start-up, calibration, injected and regular sequences with triggers, sampling
  * and conversion times. Twelve bits and fewer, single mode, without queue of contexts.
  */
+#include <stdlib.h>
 #include <string.h>
 
 #include "stm32g4/nvic.h"
@@ -10,6 +11,7 @@
 #include "stm32g4/peripherals.h"
 
 #define CONVERTERS 5
+#define CHANNELS 20
 #define ISR 0x00u
 #define IER 0x04u
 #define CR 0x08u
@@ -59,6 +61,9 @@ typedef struct {
     phase_t phase;
     uint64_t regulator_from, phase_ends, calibrated_at, sampled_at, conversion_ends;
     bool injected, regular; /* sequences under way */
+    bool samples;           /* the input is still connected */
+    bool ready_seen;        /* ADRDY was read */
+    uint32_t held;          /* what it was at the end of the sampling time */
     unsigned injected_at, regular_at;
 } adc_t;
 
@@ -149,12 +154,36 @@ static unsigned regular_channel(const adc_t *adc, unsigned rank) {
 }
 
 static void begin(adc_t *adc, unsigned channel) {
-    adc->conversion_ends = soc.now + cycles(adc, sampling_half_clocks(adc, channel) + 2 * (uint64_t)bits(adc) + 1);
-    soc_schedule(EVENT_ADC + (soc_event_t)(adc - adcs), adc->conversion_ends);
+    const uint64_t sampling = sampling_half_clocks(adc, channel);
+    adc->conversion_ends = soc.now + cycles(adc, sampling + 2 * (uint64_t)bits(adc) + 1);
+    adc->samples = true;
+    soc_schedule(EVENT_ADC + (soc_event_t)(adc - adcs), soc.now + cycles(adc, sampling));
+}
+
+/* Pin of a channel, -1: none. */
+static int pin_of(unsigned adc, unsigned channel) {
+    static int pins[CONVERTERS][CHANNELS];
+    static bool found;
+    if (!found) {
+        memset(pins, 0xFF, sizeof pins);
+        for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
+            if (strncmp(row->peripheral, "ADC", 3) == 0 && strncmp(row->signal, "IN", 2) == 0 &&
+                row->signal[2] != 'N') {
+                pins[row->peripheral[3] - '1'][strtoul(row->signal + 2, NULL, 10)] = (int)row->pin;
+            }
+        }
+        found = true;
+    }
+    return channel < CHANNELS ? pins[adc][channel] : -1;
 }
 
 static uint32_t convert(adc_t *adc, unsigned channel) {
-    const uint32_t value = input ? input(input_context, (unsigned)(adc - adcs), channel) : 0;
+    const int pin = pin_of((unsigned)(adc - adcs), channel);
+    if (pin < 0 || !gpio_is_analog((unsigned)pin)) {
+        soc_violation("ADC%u converts channel %u: %s", (unsigned)(adc - adcs) + 1, channel,
+                      pin < 0 ? "no pin of the part" : "its pin is not in analogue mode");
+    }
+    const uint32_t value = input ? input(input_context, (unsigned)pin) : 0;
     return value >> (12 - bits(adc));
 }
 
@@ -180,7 +209,7 @@ static void start_regular(adc_t *adc) {
 }
 
 static void injected_ends(adc_t *adc) {
-    ADC_REG(adc, JDR1 + 4 * adc->injected_at) = convert(adc, injected_channel(adc, adc->injected_at));
+    ADC_REG(adc, JDR1 + 4 * adc->injected_at) = adc->held;
     const bool last = adc->injected_at == (ADC_REG(adc, JSQR) & 3);
     ++adc->injected_at;
     if (!last) {
@@ -204,7 +233,7 @@ static void regular_ends(adc_t *adc) {
         flag(adc, ISR_OVR);
     }
     if (!(ADC_REG(adc, ISR) & ISR_OVR) || cfgr >> 12 & 1) {
-        ADC_REG(adc, DR) = convert(adc, regular_channel(adc, adc->regular_at));
+        ADC_REG(adc, DR) = adc->held;
     }
     const bool last = adc->regular_at == (ADC_REG(adc, SQR1) & 15);
     adc->regular_at = last ? 0 : adc->regular_at + 1;
@@ -231,6 +260,11 @@ void adc_event(unsigned number) {
     } else if (adc->phase == STARTING) {
         adc->phase = IDLE;
         flag(adc, ISR_ADRDY);
+    } else if (adc->samples && (adc->injected || adc->regular)) {
+        adc->samples = false;
+        adc->held = convert(adc, adc->injected ? injected_channel(adc, adc->injected_at)
+                                               : regular_channel(adc, adc->regular_at));
+        soc_schedule(EVENT_ADC + (soc_event_t)number, adc->conversion_ends);
     } else if (adc->injected) {
         injected_ends(adc);
     } else if (adc->regular) {
@@ -324,12 +358,13 @@ static void enable(adc_t *adc, uint32_t value) {
     }
     ADC_REG(adc, CR) |= CR_ADEN;
     adc->phase = STARTING;
+    adc->ready_seen = false;
     soc_schedule(EVENT_ADC + (soc_event_t)(adc - adcs), soc.now + cycles(adc, 2 * START_CLOCKS));
 }
 
 static void start(adc_t *adc, uint32_t value) {
-    if (!(ADC_REG(adc, CR) & CR_ADEN) || adc->phase == STARTING) {
-        refuse(adc, CR, value, "a start before the converter is ready (ADRDY)");
+    if (!(ADC_REG(adc, CR) & CR_ADEN) || adc->phase == STARTING || !adc->ready_seen) {
+        refuse(adc, CR, value, "a start before the converter is ready (ADRDY), or without having read that");
     }
     clock_hz(adc);
     const uint32_t rises = value & ~ADC_REG(adc, CR);
@@ -400,6 +435,9 @@ static void adc_write(uint32_t address, uint32_t value) {
         break;
     case JSQR:
         check_idle(adc, offset, value, CR_JADSTART);
+        if (value >> 8 & 1 && (value >> 2 & 31) != 6) {
+            refuse(adc, offset, value, "the falling edge of a timer's pulse, of a length that no manual gives");
+        }
         break;
     case CFGR2:
         if (value) {
@@ -420,6 +458,9 @@ static void adc_write(uint32_t address, uint32_t value) {
 }
 
 static uint32_t adc_read(uint32_t address) {
+    for (unsigned i = 0; i < CONVERTERS && (address & 0xFF) == ISR; ++i) {
+        adcs[i].ready_seen = adcs[i].ready_seen || (address == adcs[i].base && REG(address) & ISR_ADRDY);
+    }
     if ((address & 0xFF) == DR) {
         REG(address - DR + ISR) &= ~ISR_EOC;
         lines();

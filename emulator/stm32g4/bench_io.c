@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
 #include "stm32g4/bench_io.h"
 
-#include <stdlib.h>
 #include <string.h>
 
 #include "stm32g4/flash.h"
@@ -10,14 +9,11 @@
 
 #define CONVERTER_BITS 12
 #define VREF_V 3.3
-#define CHANNELS 20
-#define CONVERTERS 5
 #define MEMORY_FIRST_PAGE 0 /* of bank 2 */
 #define EDGES_MAX (2 * TIMER_EDGES_MAX)
 
 static board_t *board;
 static wiring_t wiring;
-static int pin_of_channel[CONVERTERS][CHANNELS];
 static can_mailbox_t *mailbox[3];
 static uint64_t mailbox_request[3];
 static uint32_t encoder_at; /* count whose levels the pins have */
@@ -41,23 +37,9 @@ static uint16_t code_at(int pin) {
                                   : 0;
 }
 
-static uint16_t analogue(void *context, unsigned adc, unsigned channel) {
+static uint16_t analogue(void *context, unsigned pin) {
     (void)context;
-    const int pin = channel < CHANNELS ? pin_of_channel[adc][channel] : WIRING_NONE;
-    if (pin < 0 || !gpio_is_analog((unsigned)pin)) {
-        soc_violation("ADC%u converts channel %u: %s", adc + 1, channel,
-                      pin < 0 ? "no pin of the part" : "its pin is not in analogue mode");
-    }
-    return code_at(pin);
-}
-
-static void find_channels(void) {
-    memset(pin_of_channel, 0xFF, sizeof pin_of_channel);
-    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-        if (strncmp(row->peripheral, "ADC", 3) == 0 && strncmp(row->signal, "IN", 2) == 0 && row->signal[2] != 'N') {
-            pin_of_channel[row->peripheral[3] - '1'][strtoul(row->signal + 2, NULL, 10)] = (int)row->pin;
-        }
-    }
+    return code_at((int)pin);
 }
 
 /* --- Lines --- */
@@ -278,7 +260,6 @@ void bench_io_reset(void) {
 void bench_io_open(board_t *of, const wiring_t *pins) {
     board = of;
     wiring = *pins;
-    find_channels();
     adc_set_input(analogue, NULL);
     fdcan_join(&(fdcan_bus_t){.send = send,
                               .pending = pending,

@@ -30,6 +30,7 @@
 #define RNG_SR (RNG + 0x04)
 #define RNG_DR (RNG + 0x08)
 #define RNGEN 4u
+#define RANDOM_NS 4000u /* about 200 cycles of 48 MHz for a number */
 #define NS_PER_S 1e9
 
 static struct {
@@ -41,6 +42,7 @@ static struct {
     apart_random_t random;
     void *random_context;
     uint64_t state;
+    uint64_t number_ready_ns; /* RNG_DR has the next number */
 } apart = {.ratio = 1.0};
 
 /* --- Independent watchdog --- */
@@ -105,6 +107,14 @@ void apart_set_lse_ratio(double ratio) {
     apart.ratio = ratio;
 }
 
+static bool random_ready(void) {
+    return REG(RNG_CR) & RNGEN && (soc.untimed || soc_ns(soc.now) >= apart.number_ready_ns);
+}
+
+static void next_random(void) {
+    apart.number_ready_ns = soc_ns(soc.now) + RANDOM_NS;
+}
+
 static uint32_t apart_read(uint32_t address) {
     switch (address) {
     case LPTIM_CNT:
@@ -113,11 +123,15 @@ static uint32_t apart_read(uint32_t address) {
         if (REG(RNG_CR) & RNGEN && !rcc_hsi48_ready()) {
             soc_violation("read of RNG_SR: its 48 MHz clock does not run (RCC_CRRCR, RCC_CCIPR.CLK48SEL)");
         }
-        return REG(RNG_CR) & RNGEN ? 1 : 0;
+        return random_ready();
     case RNG_DR:
         if (!(REG(RNG_CR) & RNGEN)) {
             soc_violation("read of RNG_DR: RNG_CR.RNGEN is 0");
         }
+        if (!random_ready()) {
+            soc_violation("read of RNG_DR: RNG_SR.DRDY is 0, it reads as zero");
+        }
+        next_random();
         if (apart.random) {
             return apart.random(apart.random_context);
         }
@@ -175,6 +189,9 @@ static void rng_write(uint32_t address, uint32_t value) {
     if (address == RNG_CR && value & RNGEN && !rcc_hsi48_ready()) {
         soc_violation("write of RNG_CR, value 0x%X: its 48 MHz clock does not run (RCC_CRRCR, RCC_CCIPR.CLK48SEL)",
                       value);
+    }
+    if (address == RNG_CR && value & RNGEN && !(REG(RNG_CR) & RNGEN)) {
+        next_random();
     }
     REG(address) = value;
 }

@@ -346,6 +346,21 @@ void cpu_memory_write(uint32_t address, uint32_t value, unsigned size) {
     }
 }
 
+static void torn_read(uc_engine *uc, uc_mem_type type, uint64_t address, int size, int64_t value, void *context) {
+    (void)uc;
+    (void)type;
+    (void)size;
+    (void)value;
+    (void)context;
+    flash_double_error((uint32_t)address - FLASH_BASE, false);
+}
+
+void cpu_tear(uint32_t address) {
+    uc_hook hook;
+    check(uc_hook_add(engine, &hook, UC_HOOK_MEM_READ, (void *)torn_read, NULL, address, address + 7),
+          "hook of a torn word");
+}
+
 void cpu_open(void) {
     check(uc_open(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS, &engine), "Unicorn");
     check(uc_ctl_set_cpu_model(engine, UC_CPU_ARM_CORTEX_M4), "Cortex-M4");

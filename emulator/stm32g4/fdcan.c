@@ -68,8 +68,11 @@ static struct {
     uint8_t order[BUFFERS]; /* requested buffers, oldest first */
     unsigned requested;
     bool sent[BUFFERS]; /* given to the bus */
+    bool leaving;       /* in loop-back a frame is being sent */
+    uint8_t buffer;     /* it */
     unsigned get[2], level[2];
-    bool was_off;
+    unsigned tec, rec; /* alone: as a program's bench has set them */
+    bool off, was_off;
     bool was_warned, was_passive;
 } can;
 
@@ -251,6 +254,7 @@ static void left(unsigned buffer) {
     REG(TXBRP) &= ~(1u << buffer);
     REG(TXBTO) |= 1u << buffer;
     can.sent[buffer] = false;
+    can.leaving = can.leaving && can.buffer != buffer;
     unsigned kept = 0;
     for (unsigned i = 0; i < can.requested; ++i) {
         if (can.order[i] != buffer) {
@@ -267,6 +271,22 @@ static uint64_t frame_cycles(const fdcan_frame_t *frame) {
     return (uint64_t)(47u + (frame->extended ? 20u : 0u) + 8u * bytes) * soc.hclk_hz / bit_rate();
 }
 
+/* Order of arbitration: smaller wins. A standard identifier wins against an extended one that begins with it. */
+static uint32_t arbitration(unsigned buffer) {
+    const fdcan_frame_t frame = frame_of(buffer);
+    return frame.extended ? (frame.identifier >> 18) << 20 | 1u << 19 | (frame.identifier & 0x3FFFF)
+                          : frame.identifier << 20 | (uint32_t)frame.remote;
+}
+
+/* The next of the requested buffers: of a queue the one that wins, of a FIFO the oldest. */
+static uint8_t next_buffer(void) {
+    uint8_t next = can.order[0];
+    for (unsigned i = 1; REG(TXBC) >> 24 & 1 && i < can.requested; ++i) {
+        next = arbitration(can.order[i]) < arbitration(next) ? can.order[i] : next;
+    }
+    return next;
+}
+
 /* Gives requested frames to the bus: of a queue all, of a FIFO the oldest alone. */
 static void offer(void) {
     const bool queue = REG(TXBC) >> 24 & 1;
@@ -274,8 +294,12 @@ static void offer(void) {
         return;
     }
     if (!can.joined || loops_back()) {
-        const fdcan_frame_t frame = frame_of(can.order[0]);
-        soc_schedule(EVENT_FDCAN, soc.now + frame_cycles(&frame));
+        if (!can.leaving) {
+            can.leaving = true;
+            can.buffer = next_buffer();
+            const fdcan_frame_t frame = frame_of(can.buffer);
+            soc_schedule(EVENT_FDCAN, soc.now + frame_cycles(&frame));
+        }
         return;
     }
     for (unsigned i = 0; i < (queue ? can.requested : 1); ++i) {
@@ -295,7 +319,7 @@ void fdcan_event(void) {
     if (!loops_back()) {
         return; /* nobody acknowledges */
     }
-    const unsigned buffer = can.order[0];
+    const unsigned buffer = can.buffer;
     const fdcan_frame_t frame = frame_of(buffer);
     left(buffer);
     fdcan_deliver(&frame);
@@ -303,19 +327,20 @@ void fdcan_event(void) {
 }
 
 static void error_state(void) {
-    unsigned tec, rec;
-    bool off;
-    can.bus.state(can.bus.context, &tec, &rec, &off);
+    unsigned tec = can.tec, rec = can.rec;
+    bool off = can.off;
+    if (can.joined) {
+        can.bus.state(can.bus.context, &tec, &rec, &off);
+    }
     const bool warned = tec >= 96 || rec >= 96, passive = tec > 127 || rec > 127;
     uint32_t flags = 0;
     flags |= warned != can.was_warned ? IR_EW : 0;
     flags |= passive != can.was_passive ? IR_EP : 0;
     flags |= off != can.was_off ? IR_BO : 0;
     if (off && !can.was_off) {
-        REG(CCCR) |= CCCR_INIT;
+        REG(CCCR) |= CCCR_INIT; /* the requests stay: they are sent after the return, unless CCE clears them */
         memset(can.sent, 0, sizeof can.sent);
-        can.requested = 0;
-        REG(TXBRP) = 0;
+        can.leaving = false;
     }
     can.was_warned = warned;
     can.was_passive = passive;
@@ -328,16 +353,20 @@ static void error_state(void) {
 }
 
 void fdcan_refresh(void) {
-    if (!can.joined) {
-        return;
-    }
-    for (unsigned buffer = 0; buffer < BUFFERS; ++buffer) {
+    error_state();
+    for (unsigned buffer = 0; can.joined && buffer < BUFFERS; ++buffer) {
         if (can.sent[buffer] && !can.bus.pending(can.bus.context, buffer)) {
             left(buffer);
         }
     }
-    error_state();
     offer();
+}
+
+void fdcan_set_errors(unsigned tec, unsigned rec, bool off) {
+    can.tec = tec;
+    can.rec = rec;
+    can.off = off;
+    fdcan_refresh();
 }
 
 static void request(uint32_t buffers) {
@@ -417,13 +446,21 @@ static void mode_write(uint32_t value) {
         soc_violation("write of FDCAN1_CCCR, value 0x%X: CCE is set with INIT = 1 alone", value);
     }
     REG(CCCR) = value & CCCR_INIT ? value : value & ~CCCR_CCE;
+    if (value & CCCR_CCE && !(old & CCCR_CCE)) { /* resets the states of FIFOs and buffers */
+        can.requested = 0;
+        can.leaving = false;
+        can.get[0] = can.get[1] = can.level[0] = can.level[1] = 0;
+        REG(TXBRP) = REG(TXBTO) = REG(TXBCF) = 0;
+    }
     if (old & CCCR_INIT && !(value & CCCR_INIT)) {
         check_timing();
         if (can.joined) {
             can.bus.rejoin(can.bus.context);
-            fdcan_refresh();
+        } else if (can.off) {
+            can.off = false;
+            can.tec = can.rec = 0;
         }
-        offer();
+        fdcan_refresh();
     }
 }
 
@@ -488,6 +525,8 @@ void fdcan_attach(void) {
 
 void fdcan_reset(void) {
     memset(can.sent, 0, sizeof can.sent);
+    can.leaving = can.off = can.was_off = can.was_warned = can.was_passive = false;
+    can.tec = can.rec = 0;
     can.requested = 0;
     can.get[0] = can.get[1] = can.level[0] = can.level[1] = 0;
     lines();

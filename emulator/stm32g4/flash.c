@@ -16,6 +16,7 @@
 #define IRQ_FLASH CPU_IRQ(4)
 #define NMI 2u
 
+#define ACR_DCEN (1u << 10)
 #define SR_EOP 0x1u
 #define SR_PROGERR 0x8u
 #define SR_PGAERR 0x20u
@@ -49,6 +50,8 @@ static struct {
     unsigned store_first, store_pages;
     uint8_t system[0x1000];
     uint64_t busy_until;
+    bool cached;                       /* an operation has ended since the data cache was emptied */
+    unsigned first_changing, changing; /* double words of the operation */
 } flash;
 
 unsigned flash_wait_states(void) {
@@ -107,7 +110,10 @@ static void fail(uint32_t flag) {
     line();
 }
 
-static void begin(uint64_t ns) {
+static void begin(uint64_t ns, unsigned first, unsigned count) {
+    flash.cached = true;
+    flash.first_changing = first;
+    flash.changing = count;
     if (soc.untimed) {
         flash_event();
         return;
@@ -148,7 +154,7 @@ static void erase(void) {
         memset(soc.flash + FLASH_BANK_BYTES + page * FLASH_PAGE_BYTES, 0xFF, FLASH_PAGE_BYTES);
     }
     memset(flash.torn + page * PAGE_DOUBLE_WORDS, 0, PAGE_DOUBLE_WORDS * sizeof flash.torn[0]);
-    begin(ERASE_NS);
+    begin(ERASE_NS, page * PAGE_DOUBLE_WORDS, PAGE_DOUBLE_WORDS);
 }
 
 static void program(unsigned double_word, uint64_t value) {
@@ -162,7 +168,7 @@ static void program(unsigned double_word, uint64_t value) {
     } else {
         memcpy(soc.flash + FLASH_BANK_BYTES + 8u * double_word, &value, sizeof value);
     }
-    begin(PROGRAM_NS);
+    begin(PROGRAM_NS, double_word, 1);
 }
 
 void flash_bank_2_write(uint32_t offset, uint32_t value, unsigned size) {
@@ -193,16 +199,30 @@ void flash_bank_2_write(uint32_t offset, uint32_t value, unsigned size) {
     }
 }
 
+void flash_double_error(uint32_t offset, bool bank_2) {
+    if (!(REG(ECCR) & ECCR_ECCD)) {
+        REG(ECCR) = (REG(ECCR) & 1u << 24) | ECCR_ECCD | (bank_2 ? 1u << 21 : 0) | ((offset & ~7u) & 0x7FFFF);
+        nvic_line(NMI, true);
+    }
+}
+
+void flash_cache_emptied(void) {
+    flash.cached = false;
+}
+
 uint32_t flash_bank_2_read(uint32_t offset, unsigned size) {
     (void)size;
+    if (flash.cached && REG(ACR) & ACR_DCEN) {
+        soc_violation("read of 0x%08X: the data cache has not been emptied since the last operation (FLASH_ACR.DCRST)",
+                      FLASH_BASE + FLASH_BANK_BYTES + offset);
+    }
     if (REG(SR) & SR_BSY) {
         cpu_stall(flash.busy_until); /* the same bank: the bus waits */
     }
     const unsigned double_word = offset / 8;
     const uint64_t value = content(double_word);
-    if (flash.torn[double_word] && !(REG(ECCR) & ECCR_ECCD)) {
-        REG(ECCR) = (REG(ECCR) & 1u << 24) | ECCR_ECCD | 1u << 21 | (offset & ~7u);
-        nvic_pend(NMI);
+    if (flash.torn[double_word]) {
+        flash_double_error(offset, true);
     }
     return (uint32_t)(value >> 8 * (offset % 8));
 }
@@ -255,6 +275,7 @@ static void flash_write(uint32_t address, uint32_t value) {
         break;
     case ECCR:
         REG(ECCR) = (REG(ECCR) & ~(value & 0xF0000000u) & ~(1u << 24)) | (value & 1u << 24);
+        nvic_line(NMI, REG(ECCR) & ECCR_ECCD); /* as long as the flag is set */
         break;
     default:
         soc_violation("write of %s, value 0x%08X: not modelled", soc_name(address), value);
@@ -265,7 +286,16 @@ void flash_attach(void) {
     soc_attach(FLASH + 4, 0x400 - 4, 0x40021048u, 8, 0, flash_write);
 }
 
+/* A reset stops an operation: its double words are torn. A bench's memory has a way of its own. */
 void flash_reset(void) {
+    if (flash.busy_until > soc.now) {
+        for (unsigned i = 0; i < flash.changing && stored(flash.first_changing) < 0; ++i) {
+            flash.torn[flash.first_changing + i] = true;
+        }
+    }
+    flash.busy_until = 0;
+    flash.cached = false;
+    nvic_line(NMI, false);
     flash.keys = 0;
     flash.first_written = false;
 }

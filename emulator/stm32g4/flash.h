@@ -19,6 +19,12 @@ unsigned flash_wait_states(void);
 /* Identifiers and calibration values: the 4 KiB at 0x1FFF7000. */
 void *flash_system_memory(void);
 
+/* A read of bank 1 or 2 has found a double error. */
+void flash_double_error(uint32_t offset, bool bank_2);
+
+/* The data cache has been emptied. */
+void flash_cache_emptied(void);
+
 uint32_t flash_bank_2_read(uint32_t offset, unsigned size);
 void flash_bank_2_write(uint32_t offset, uint32_t value, unsigned size);
 

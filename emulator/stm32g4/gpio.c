@@ -187,9 +187,32 @@ static uint32_t gpio_read(uint32_t address) {
     return value;
 }
 
+/* A pin that becomes an alternate function has one: the number is written first. */
+static void check_functions(uint32_t base, uint32_t value) {
+    for (unsigned i = 0; i < 16; ++i) {
+        const unsigned pin = (base - GPIO) / PORT_BYTES * 16 + i,
+                       number = *port(pin, AFRL + 4 * (i / 8)) >> 4 * (i % 8) & 15;
+        if ((value >> 2 * i & 3) != MODE_FUNCTION || mode(pin) == MODE_FUNCTION) {
+            continue;
+        }
+        const pin_row_t *row = pins_first();
+        while (row < pins_end() && !(row->pin == pin && row->function == (int)number)) {
+            ++row;
+        }
+        if (row == pins_end()) {
+            soc_violation("write of %s, value 0x%08X: %s has no alternate function %u", soc_name(base), value,
+                          gpio_name(pin), number);
+        }
+    }
+}
+
 static void gpio_write(uint32_t address, uint32_t value) {
     const uint32_t base = address & ~(PORT_BYTES - 1);
     switch (address - base) {
+    case MODER:
+        check_functions(base, value);
+        REG(address) = value;
+        break;
     case BSRR:
         REG(base + ODR) = ((REG(base + ODR) & ~(value >> 16)) | (value & 0xFFFF)) & 0xFFFF;
         break;

@@ -11,19 +11,17 @@
 #include "stm32g4/bench.h"
 #include "stm32g4/cpu.h"
 #include "stm32g4/edge_file.h"
-#include "stm32g4/part_pins.h"
+#include "stm32g4/nvic.h"
 #include "stm32g4/peripherals.h"
 
 #define EXIT_USAGE_OF_ALONE 2
-#define CHANNELS 20
-#define CONVERTERS 5
 #define LIMIT_DEFAULT_US 10000000u
 
-static uint16_t codes[CONVERTERS][CHANNELS];
+static uint16_t codes[GPIO_PINS];
 
-static uint16_t analogue(void *context, unsigned adc, unsigned channel) {
+static uint16_t analogue(void *context, unsigned pin) {
     (void)context;
-    return channel < CHANNELS ? codes[adc][channel] : 0;
+    return codes[pin];
 }
 
 static int usage(const char *program) {
@@ -67,6 +65,11 @@ static int wire(const char *value) {
 }
 
 /* A code at a pin: for the converters and the comparators that it leads to. */
+static void apply_code(unsigned pin, unsigned code) {
+    codes[pin] = (uint16_t)code;
+    analog_set_pin(pin, (double)code / 4096.0 * 3.3);
+}
+
 static int set_analog(const char *value) {
     const char *equals = strchr(value, '=');
     const int pin = pin_of(value);
@@ -74,14 +77,32 @@ static int set_analog(const char *value) {
     if (pin < 0 || code > 4095) {
         return mistake("--analogue", value);
     }
-    for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-        if (row->pin == (unsigned)pin && strncmp(row->peripheral, "ADC", 3) == 0 &&
-            strncmp(row->signal, "IN", 2) == 0 && row->signal[2] != 'N') {
-            codes[row->peripheral[3] - '1'][strtoul(row->signal + 2, NULL, 10)] = (uint16_t)code;
-        }
-    }
-    analog_set_pin((unsigned)pin, (double)code / 4096.0 * 3.3);
+    apply_code((unsigned)pin, (unsigned)code);
     return 0;
+}
+
+/* The program is its own bench: stimulus port 1 gives a pin a code, port 2 a level; number of the pin in the upper half
+ * of the word. Port 3: errors of the bus, transmit counter, receive counter << 8, bus-off << 16. Port 4: address of a
+ * word of bank 1 with a double error. */
+static void stimulus(unsigned port, uint32_t value) {
+    const unsigned pin = value >> 16;
+    if (port == 3) {
+        fdcan_set_errors(value & 0xFF, value >> 8 & 0xFF, value >> 16 & 1);
+        return;
+    }
+    if (port == 4) {
+        cpu_tear(value);
+        return;
+    }
+    if (pin >= GPIO_PINS) {
+        soc_violation("stimulus port %u, value 0x%X: no such pin", port, value);
+    }
+    if (port == 1) {
+        apply_code(pin, value & 0xFFF);
+        analog_refresh();
+    } else {
+        gpio_drive(pin, value & 1);
+    }
 }
 
 static int alone(int argc, char *argv[]) {
@@ -116,6 +137,7 @@ static int alone(int argc, char *argv[]) {
         }
     }
     adc_set_input(analogue, NULL);
+    nvic_set_stimulus(stimulus);
     for (;;) {
         const uint64_t end = soc_cycle_of_ns(limit_us * 1000);
         cpu_run(end, false);

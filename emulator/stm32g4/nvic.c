@@ -13,6 +13,7 @@
 #define PENDSV 14u
 #define SYSTICK 15u
 #define NO_PRIORITY 256
+#define STIMULUS_PORTS 5u
 
 static struct {
     uint64_t pending[WORDS], enabled[WORDS], active[WORDS], level[WORDS];
@@ -24,6 +25,12 @@ static struct {
     uint64_t systick_from; /* cycle at which it had the reload value */
     bool systick_counted;
 } nvic;
+
+static nvic_stimulus_t stimulus;
+
+void nvic_set_stimulus(nvic_stimulus_t function) {
+    stimulus = function;
+}
 
 static bool get(const uint64_t *bits, unsigned n) {
     return bits[n / 64] >> (n % 64) & 1;
@@ -357,6 +364,10 @@ void nvic_write(uint32_t offset, uint32_t value, unsigned size) {
         for (unsigned i = 0; i < (size == 1 ? 1u : size); ++i) {
             putchar((int)(value >> 8 * i & 0xFF));
         }
+        return;
+    }
+    if (offset < 4 * STIMULUS_PORTS && size == 4 && stimulus) {
+        stimulus(offset / 4, value);
         return;
     }
     if (offset >= 0xE400 && offset < 0xE400 + 240) {

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
- * NVIC, system control block, SysTick, and of the debug blocks the cycle counter and the first stimulus port: its bytes
- * go to standard output. ARMv7-M ARM, B1.5, B3.2 to B3.4.
+ * NVIC, system control block, SysTick, and of the debug blocks the cycle counter and the stimulus ports: bytes of the
+ * first go to standard output, words of the others to a bench. ARMv7-M ARM, B1.5, B3.2 to B3.4.
  */
 #ifndef STM32G4_NVIC_H
 #define STM32G4_NVIC_H
@@ -32,6 +32,10 @@ uint32_t nvic_vectors(void);
 /* Registers of 0xE0000000 to 0xE00FFFFF; offset from there. */
 uint32_t nvic_read(uint32_t offset, unsigned size);
 void nvic_write(uint32_t offset, uint32_t value, unsigned size);
+
+/* What a program writes to a stimulus port from 1 on, for a bench. */
+typedef void (*nvic_stimulus_t)(unsigned port, uint32_t value);
+void nvic_set_stimulus(nvic_stimulus_t function);
 
 /* EVENT_SYSTICK. */
 void nvic_systick_event(void);

@@ -62,8 +62,8 @@ unsigned timer_edges(unsigned pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_M
 void adc_attach(void);
 void adc_reset(void);
 void adc_event(unsigned number);
-void adc_trigger(unsigned source); /* an internal trigger: TIM1_TRGO and others, adc.c */
-typedef uint16_t (*adc_input_t)(void *context, unsigned adc, unsigned channel); /* 0..4095 */
+void adc_trigger(unsigned source);                            /* an internal trigger: TIM1_TRGO and others, adc.c */
+typedef uint16_t (*adc_input_t)(void *context, unsigned pin); /* 0..4095 */
 void adc_set_input(adc_input_t function, void *context);
 /* The instant at which converter 0 sampled last, for the bench. */
 uint64_t adc_sampled_at(unsigned adc);
@@ -100,9 +100,10 @@ void fdcan_attach(void);
 void fdcan_reset(void);
 void fdcan_event(void);
 void fdcan_join(const fdcan_bus_t *bus);
-bool fdcan_deliver(const fdcan_frame_t *frame); /* from the bus; false: not taken */
-bool fdcan_room(void);                          /* both FIFOs take a frame */
-void fdcan_refresh(void);                       /* the bus has moved on */
+bool fdcan_deliver(const fdcan_frame_t *frame);              /* from the bus; false: not taken */
+bool fdcan_room(void);                                       /* both FIFOs take a frame */
+void fdcan_refresh(void);                                    /* the bus has moved on */
+void fdcan_set_errors(unsigned tec, unsigned rec, bool off); /* without a bus */
 
 /* --- Watchdog (42), low-power timer (34), random numbers (26): clocks_apart.c --- */
 void apart_attach(void);

@@ -21,9 +21,11 @@
 #define PWR_SR2 0x40007014u
 #define PWR_CR5 0x40007080u
 #define FLASH_ACR 0x40022000u
+#define ACR_DCRST (1u << 12)
 
 #define CSR_RESET_FLAGS 0xFE000000u
 #define CSR_RMVF (1u << 23)
+#define CSR_BORRSTF (1u << 27)
 
 #define HSI_HZ 16000000u
 #define HSE_HZ 24000000u /* crystal X3 of the NUCLEO-G474RE */
@@ -37,6 +39,7 @@ typedef enum { HSE, PLL, LSI, LSE, HSI48, OSCILLATORS } oscillator_t;
 static const uint32_t start_ns[OSCILLATORS] = {
     [HSE] = 2000000, [PLL] = 40000, [LSI] = 130000, [LSE] = 1000000, [HSI48] = 2500};
 
+static uint32_t reset_flags;
 static uint64_t ready_ns[OSCILLATORS]; /* SOC_NEVER: off */
 static uint64_t halved_from_ns;        /* the system clock was selected */
 
@@ -282,6 +285,7 @@ static void rcc_write(uint32_t address, uint32_t value) {
         bdcr_write(value);
         break;
     case CSR:
+        reset_flags = value & CSR_RMVF ? 0 : reset_flags;
         REG(CSR) = (value & 1) | (value & CSR_RMVF ? 0 : REG(CSR) & CSR_RESET_FLAGS);
         run(LSI, value & 1);
         break;
@@ -306,6 +310,12 @@ static void pwr_write(uint32_t address, uint32_t value) {
 }
 
 static void acr_write(uint32_t address, uint32_t value) {
+    if (value >> 2 & REG(address) & 0x600) {
+        soc_violation("write of FLASH_ACR, value 0x%X: a cache is emptied while it is enabled", value);
+    }
+    if (value & ACR_DCRST) {
+        flash_cache_emptied();
+    }
     REG(address) = value;
     check_speed(soc.hclk_hz);
 }
@@ -324,7 +334,8 @@ void rcc_reset(uint32_t cause) {
     }
     ready_ns[LSE] = lse ? lse_ns : SOC_NEVER;
     REG(BDCR) = lse ? 1 : 0;
-    REG(CSR) = cause & CSR_RESET_FLAGS;
+    reset_flags = (cause & CSR_BORRSTF ? 0 : reset_flags) | (cause & CSR_RESET_FLAGS); /* until RMVF, or power-on */
+    REG(CSR) = reset_flags;
     halved_from_ns = 0;
     clocks_changed();
 }

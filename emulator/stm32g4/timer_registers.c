@@ -72,6 +72,9 @@ static void event_write(tim_t *timer, uint32_t value) {
         if ((TIMER_REG(timer, TIM_CR2) >> 4 & 7) == 0) {
             timer_trigger_out(timer, false);
         }
+        if (timer->facts->advanced && (TIMER_REG(timer, TIM_CR2) >> 20 & 15) == 0) {
+            timer_trigger_out(timer, true);
+        }
     }
     for (unsigned channel = 0; channel < TIMER_CHANNELS; ++channel) {
         if (value >> (1 + channel) & 1) {

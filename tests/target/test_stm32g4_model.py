@@ -5,6 +5,7 @@ check that fails."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -14,7 +15,8 @@ import pytest
 from salient.paths import BUILD, ROOT
 
 SOURCES = ROOT / "tests" / "target" / "stm32g4"
-MODEL = BUILD / "host" / "bin" / "salient_stm32g4"
+MODEL = Path(os.environ.get("SALIENT_STM32G4", BUILD / "host" / "bin" / "salient_stm32g4"))
+"""Another one, with a mistake: salient.experiments.board_mistakes."""
 COMPILER = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-O1", "-ffreestanding", "-nostdlib", "-Wall", "-Wextra",
             "-Werror", "-T", str(SOURCES / "part.ld"), str(SOURCES / "part.c")]
 VIOLATION = 70
@@ -51,6 +53,9 @@ def test_exceptions_come_in_the_order_of_their_priorities(tmp_path: Path) -> Non
     ("encoder", ("--wire", "PB0=PA0", "--wire", "PB1=PA1", "--wire", "PB2=PA5")),
     ("fdcan", ()),
     ("flash", ()),
+    ("torn", ()),
+    ("exti", ()),
+    ("comparators", ()),
 ])
 def test_peripheral_behaves_as_the_manual_says(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
     assert passes(run(tmp_path, name, *options))
@@ -88,6 +93,19 @@ def test_edges_of_every_compare_value_follow_the_mode(tmp_path: Path, mode: int,
     assert shown == changes
 
 
+@pytest.mark.parametrize(("code", "ticks"), [(0, 0), (1, 1), (0x7F, 127), (0x80, 128), (0xBF, 254), (0xC0, 256),
+                                             (0xDF, 504), (0xE0, 512), (0xFF, 1008)])
+def test_dead_time_delays_the_edges_that_switch_on(tmp_path: Path, code: int, ticks: int) -> None:
+    trace = tmp_path / "edges.txt"
+    assert passes(run(tmp_path, "dead_time", "--trace", str(trace), "PC0", "PC13", definitions=(f"DTG={code}",)))
+    edges = [(int(cycle), pin, int(level)) for cycle, pin, level in map(str.split, trace.read_text().splitlines())]
+    falls = {pin: [cycle for cycle, at, level in edges if at == pin and not level] for pin in ("PC0", "PC13")}
+    rises = {pin: [cycle for cycle, at, level in edges if at == pin and level] for pin in ("PC0", "PC13")}
+    for on, off in (("PC0", "PC13"), ("PC13", "PC0")):
+        fall = next(cycle for cycle in falls[off] if cycle > edges[0][0] + 2000)
+        assert [cycle - fall for cycle in rises[on] if cycle >= fall][:1] == [ticks], (on, edges)
+
+
 @pytest.mark.parametrize(("case", "text"), list(enumerate([
     "TIM1_CR1 (0x40012C00), value 0x1: its clock is off, RCC_APB2ENR bit 11",
     "TIM1_CR1 (0x40012C00), value 0x400: reserved bits 0x400",
@@ -104,6 +122,15 @@ def test_edges_of_every_compare_value_follow_the_mode(tmp_path: Path, mode: int,
     "write of FLASH_CR, value 0xC0000001: it is locked",
     "write of RCC_BDCR, value 0x1: PWR_CR1.DBP is 0",
     "priority 0x41 of exception 16: only the upper four bits exist",
+    "write of COMP_C2CSR, value 0x80000001: it is locked",
+    "write of FLASH_KEYR, value 0x45670123: not the next key",
+    "read of 0x08040000: the data cache has not been emptied since the last operation",
+    "write of FLASH_ACR, value 0x41600: a cache is emptied while it is enabled",
+    "write of RNG_CR, value 0x4: its 48 MHz clock does not run",
+    "read of RNG_DR: RNG_SR.DRDY is 0",
+    "HCLK from 16000000 to 100000000 Hz: above 80 MHz half the frequency comes first",
+    "PC0 has no alternate function 0",
+    "the falling edge of a timer's pulse",
 ])))
 def test_breach_of_a_rule_ends_the_run_with_one_line(tmp_path: Path, case: int, text: str) -> None:
     result = run(tmp_path, "strict", definitions=(f"CASE={case}",))

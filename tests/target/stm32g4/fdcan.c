@@ -57,5 +57,15 @@ int test(void) {
     REG(CAN + 0x94) = 0;
     CHECK((REG(CAN + 0x90) & 15) == 2 && (REG(CAN + 0x90) >> 8 & 3) == 1);
     CHECK(calls == 3);
+    /* Bus-off keeps a request, which CCE clears: nothing leaves after the return. */
+    REG(BUFFER(0)) = 0x111u << 18;
+    REG(CAN + 0xCC) = BIT(0);
+    REG(0xE000000Cu) = 1u << 16 | 248;
+    CHECK(REG(CAN + 0x44) & BIT(7) && REG(CAN + 0x18) & BIT(0) && REG(CAN + 0xC8) == 1);
+    REG(CAN + 0x18) |= 3;
+    CHECK(REG(CAN + 0xC8) == 0);
+    REG(CAN + 0x18) = BIT(5) | BIT(7);
+    wait(16 * 300);
+    CHECK(!(REG(CAN + 0x44) & BIT(7)) && (REG(CAN + 0x90) & 15) == 0 && calls == 3);
     return 0;
 }

@@ -47,6 +47,49 @@ int test(void) {
     REG(RCC + 0x90) = 1; /* LSEON without DBP */
 #elif CASE == 14
     *(volatile uint8_t *)0xE000E400u = 0x41; /* four bits of priority */
+#elif CASE == 15
+    APB2ENR |= BIT(0);
+    AHB2ENR |= BIT(0);
+    REG(0x40010204u) = BIT(31);
+    REG(0x40010204u) = BIT(31) | 1; /* COMP2 is locked */
+#elif CASE == 16
+    REG(0x40022008u) = 0x45670123;
+    REG(0x40022008u) = 0x45670123; /* FLASH_KEYR: the first key again */
+#elif CASE == 17
+    REG(0x40022008u) = 0x45670123;
+    REG(0x40022008u) = 0xCDEF89AB;
+    REG(0x40022014u) = 1;
+    REG(0x08040000u) = 1;
+    REG(0x08040004u) = 2;
+    while (REG(0x40022010u) & BIT(16)) {
+    }
+    (void)REG(0x08040000u); /* from the data cache */
+#elif CASE == 18
+    REG(0x40022000u) |= BIT(12); /* DCRST with DCEN */
+#elif CASE == 19
+    AHB2ENR |= BIT(26);
+    REG(0x50060800u) = 4; /* RNG without its clock */
+#elif CASE == 20
+    REG(RCC + 0x98) = 1;
+    wait(1000);
+    AHB2ENR |= BIT(26);
+    REG(0x50060800u) = 4;
+    (void)REG(0x50060808u); /* before DRDY */
+#elif CASE == 21
+    APB1ENR1 |= BIT(28);
+    REG(0x40022000u) = (REG(0x40022000u) & ~15u) | 4;
+    REG(RCC + 0x0C) = 2u | 3u << 4 | 50u << 8 | BIT(24); /* 100 MHz */
+    REG(RCC) |= BIT(24);
+    while (!(REG(RCC) & BIT(25))) {
+    }
+    REG(RCC + 0x08) = 3; /* at once */
+#elif CASE == 22
+    AHB2ENR |= BIT(2);
+    AFR(C, 0) = 0;
+    MODER(C) = (MODER(C) & ~3u) | 2; /* PC0 has no function 0 */
+#elif CASE == 23
+    AHB2ENR |= BIT(13);
+    REG(0x5000004Cu) = 8u << 2 | 2u << 7; /* JSQR: falling edge of TRGO2 */
 #endif
     return 0;
 }
