@@ -1,50 +1,32 @@
 """The image of the board in the model of its part is bit-identical with the host executable of the same clock.
 
-Compared are the recorded true state (currents, flux linkages, speed and torque) and the CAN frames with their times,
-but for the first one of each message: the image's background runs once before the first control period, the host's
-after it. DRIVE_THERMAL is left out, whose heating by the background begins then.
+Compared are the recorded true state (currents, flux linkages, speed and torque) and the CAN frames with their times, as
+salient.board.same_bits has them.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
+import contextlib
 
 import pytest
 from test_same_bits import load_step_150, start_600
 
-from salient.bench.programs import BOARD_CLOCK_MHZ
-from salient.bus.signals import drive_database
-from salient.config import BOARD_BUILD, CONTROLLERS
-from salient.paths import BUILD, ROOT
+from salient.bench import programs
+from salient.bench.drive import DriveError
+from salient.board.same_bits import after_the_first, pair
+from salient.config import CONTROLLERS
 
-
-@pytest.fixture(scope="session")
-def host_of_the_clock() -> Path:
-    """The host executable whose PWM timer has the clock of the image."""
-    folder = BUILD / f"host-{BOARD_CLOCK_MHZ}"
-    for command in (["cmake", "--preset", "host", "-B", str(folder), f"-DSALIENT_PWM_CLOCK_MHZ={BOARD_CLOCK_MHZ}",
-                     f"-DSALIENT_PYTHON={sys.executable}"],
-                    ["cmake", "--build", str(folder), "--target", "salient_host"]):
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-    return folder / "bin" / "salient_host"
-
-
-def after_the_first(frames: list[tuple[int, int, bytes]]) -> list[tuple[int, int, bytes]]:
-    """The frames but for the first one of each identifier, and DRIVE_THERMAL."""
-    known: set[int] = set()
-    thermal = drive_database().get_message_by_name("DRIVE_THERMAL").frame_id
-    frames = [frame for frame in frames if frame[1] != thermal]
-    return [frame for frame in frames if frame[1] in known or known.add(frame[1])]  # type: ignore[func-returns-value]
+CLOCKS = (programs.BOARD_CLOCK_MHZ, pytest.param(170, marks=pytest.mark.in_turns))
+"""Of the processor and the PWM timer: whole nanoseconds a tick, and the board's own, whose tick is 5.88 ns."""
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("run", [start_600, load_step_150])
-def test_image_and_host_agree_in_frames_and_true_state(make_bench, host_of_the_clock, tmp_path, run, controller):
+@pytest.mark.parametrize("clock_mhz", CLOCKS)
+def test_image_and_host_agree_in_frames_and_true_state(make_bench, monkeypatch, tmp_path, clock_mhz, run, controller):
     made = []
-    for number, options in enumerate(({"program": host_of_the_clock}, {"build": BOARD_BUILD})):
+    monkeypatch.setattr(programs, "BOARD_CLOCK_MHZ", clock_mhz)
+    for number, options in enumerate(pair(clock_mhz)):
         recording = tmp_path / f"{number}.npy"
         bench = make_bench(can=f"unix:{tmp_path}/{number}.sock", record=recording, record_step_ns=10_000,
                            controller=controller, telemetry_period_ms=4, seed=3, initial_angle_deg=12.0, **options)
@@ -59,3 +41,68 @@ def test_image_and_host_agree_in_frames_and_true_state(make_bench, host_of_the_c
     assert image[1] == host[1], "true state"
     assert len(expected) > 2000
     assert [pair for pair in zip(got, expected, strict=True) if pair[0] != pair[1]] == []
+
+
+def faults(bench) -> list[object]:
+    """Each line of STO, a sensor that fails, a bus that is off and free again: causes of the faults, and how it ends."""
+    seen: list[object] = []
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.05)
+    for line in ("sto_1", "sto_2"):
+        setattr(bench.rig, line, 0)
+        bench.run_for(0.002)
+        setattr(bench.rig, line, 1)
+        bench.run_for(0.01)
+        seen.append((bench.drive.state, bench.drive.fault))
+        bench.drive.off()
+        bench.drive.clear_fault()
+        bench.drive.speed_reference_rpm = 300
+        bench.run_for(0.05)
+    bench.rig.transmit_error_counter = 256
+    bench.run_for(0.3)
+    seen.append((bench.drive.state, bench.drive.fault))
+    bench.drive.off()
+    bench.drive.clear_fault()
+    bench.drive.speed_reference_rpm = -200
+    bench.run_for(0.05)
+    bench.rig.interrupt_time_us = 30
+    bench.run_for(0.01)
+    bench.rig.interrupt_time_us = 0
+    bench.run_for(0.02)
+    return [*seen, (bench.drive.state, bench.drive.fault), round(bench.truth["speed_rpm"].last, 3)]
+
+
+def power_cuts(bench) -> list[object]:
+    """Power fails at operations of a write of parameters: the set that the next start has."""
+    bench.rig.truth_period_us = 0
+    parameters = bench.drive.parameters
+    parameters.save()
+    seen: list[object] = []
+    for operation in range(1, 40, 4):
+        parameters["over_speed_rpm"] = parameters.row("over_speed_rpm").minimum + 10 + operation
+        bench.rig.memory_cut_kind = operation // 4 % 3
+        bench.rig.memory_cut_operation = operation
+        with contextlib.suppress(DriveError):  # of a drive that has started again and stores nothing
+            parameters.save()
+        bench.run_for(0.02)
+        bench.rig.memory_cut_operation = 0
+        bench.rig.drive_reset = 1
+        bench.run_for(0.02)
+        seen.append((operation, parameters["over_speed_rpm"], bench.drive.state))
+    return seen
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("run", [faults, power_cuts])
+def test_image_and_host_meet_faults_and_power_cuts_alike(make_bench, tmp_path, run):
+    made = []
+    for number, options in enumerate(pair(programs.BOARD_CLOCK_MHZ)):
+        recording = tmp_path / f"{number}.npy"
+        bench = make_bench(can=f"unix:{tmp_path}/{number}.sock", record=recording, record_step_ns=10_000,
+                           telemetry_period_ms=4, seed=5, **options)
+        seen = run(bench)
+        bench.close()
+        made.append((seen, recording.read_bytes()))
+    assert made[1][0] == made[0][0]
+    assert made[1][1] == made[0][1], "true state"
+    assert len({str(each) for each in made[0][0]}) > 2

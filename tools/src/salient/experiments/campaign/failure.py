@@ -96,7 +96,7 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
             with Bench(config, f"unix:{temporary}/can.sock") as bench:
                 if "hash" not in result:
                     resource.prlimit(bench.simulator.pid, resource.RLIMIT_CPU, (_CRASH_MAX_S, _CRASH_MAX_S))
-                _send(bench, lines)
+                send_frames(bench, lines)
                 if folder is not None:
                     again = (f"{seed}{' --healthy' if healthy else ''}" if kept == ALL_EVENTS and programs is None else
                              folder)
@@ -117,7 +117,7 @@ def _save_bench(bench: Bench, folder: Path, notes: dict[str, Any], result: Resul
     failure.save(bench, folder, notes, config, "\n".join(f"{name} at {at_us} us" for at_us, name in found), moment)
 
 
-def _send(bench: Bench, lines: list[str]) -> None:
+def send_frames(bench: Bench, lines: list[str]) -> None:
     """Sends the frames of both clients, each at its time, as long as the emulator runs: how it ended shows when the
     bench is closed."""
     other = open_bus(bench.address)
