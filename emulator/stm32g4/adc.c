@@ -3,7 +3,6 @@
  * Converters ADC1 to ADC5 (RM0440, 21): start-up, calibration, injected and regular sequences with triggers, sampling
  * and conversion times. Twelve bits and fewer, single mode, without queue of contexts.
  */
-#include <stdlib.h>
 #include <string.h>
 
 #include "stm32g4/nvic.h"
@@ -11,7 +10,6 @@
 #include "stm32g4/peripherals.h"
 
 #define CONVERTERS 5
-#define CHANNELS 20
 #define ISR 0x00u
 #define IER 0x04u
 #define CR 0x08u
@@ -160,25 +158,8 @@ static void begin(adc_t *adc, unsigned channel) {
     soc_schedule(EVENT_ADC + (soc_event_t)(adc - adcs), soc.now + cycles(adc, sampling));
 }
 
-/* Pin of a channel, -1: none. */
-static int pin_of(unsigned adc, unsigned channel) {
-    static int pins[CONVERTERS][CHANNELS];
-    static bool found;
-    if (!found) {
-        memset(pins, 0xFF, sizeof pins);
-        for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
-            if (strncmp(row->peripheral, "ADC", 3) == 0 && strncmp(row->signal, "IN", 2) == 0 &&
-                row->signal[2] != 'N') {
-                pins[row->peripheral[3] - '1'][strtoul(row->signal + 2, NULL, 10)] = (int)row->pin;
-            }
-        }
-        found = true;
-    }
-    return channel < CHANNELS ? pins[adc][channel] : -1;
-}
-
 static uint32_t convert(adc_t *adc, unsigned channel) {
-    const int pin = pin_of((unsigned)(adc - adcs), channel);
+    const int pin = pins_of_converter((unsigned)(adc - adcs), channel);
     if (pin < 0 || !gpio_is_analog((unsigned)pin)) {
         soc_violation("ADC%u converts channel %u: %s", (unsigned)(adc - adcs) + 1, channel,
                       pin < 0 ? "no pin of the part" : "its pin is not in analogue mode");

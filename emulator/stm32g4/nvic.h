@@ -33,7 +33,7 @@ uint32_t nvic_vectors(void);
 uint32_t nvic_read(uint32_t offset, unsigned size);
 void nvic_write(uint32_t offset, uint32_t value, unsigned size);
 
-/* What a program writes to a stimulus port from 1 on, for a bench. */
+/* Words that a program writes to a stimulus port from 1 on, for a bench. */
 typedef void (*nvic_stimulus_t)(unsigned port, uint32_t value);
 void nvic_set_stimulus(nvic_stimulus_t function);
 

@@ -28,6 +28,9 @@ const pin_list_t *pins_of_timer(unsigned timer, pin_kind_t kind);
 /* Timer (from 0: TIM1) and channel of a pin with an alternate function; false: none. */
 bool pins_channel(unsigned pin, unsigned function, unsigned *timer, unsigned *channel, bool *complementary);
 
+/* Pin of a channel of a converter, from 0; -1: none. */
+int pins_of_converter(unsigned converter, unsigned channel);
+
 /* A pin is configured for a signal of a peripheral. */
 bool pins_lead(const char *peripheral, const char *signal);
 

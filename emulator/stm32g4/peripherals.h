@@ -101,6 +101,7 @@ void fdcan_reset(void);
 void fdcan_event(void);
 void fdcan_join(const fdcan_bus_t *bus);
 bool fdcan_deliver(const fdcan_frame_t *frame);              /* from the bus; false: not taken */
+int fdcan_destination(const fdcan_frame_t *frame);           /* number of the FIFO, below 0: none; fdcan_filters.c */
 bool fdcan_room(void);                                       /* both FIFOs take a frame */
 void fdcan_refresh(void);                                    /* the bus has moved on */
 void fdcan_set_errors(unsigned tec, unsigned rec, bool off); /* without a bus */

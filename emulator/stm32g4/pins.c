@@ -1,11 +1,14 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later */
 #include "stm32g4/part_pins.h"
 
+#include <stdlib.h>
 #include <string.h>
 
 #include "stm32g4/peripherals.h"
 
 #define FUNCTIONS 16
+#define CONVERTERS 5
+#define CHANNELS 20
 
 static const pin_row_t pin_rows[] = {
 #include "stm32g4/pins.inc"
@@ -79,4 +82,20 @@ bool pins_lead(const char *peripheral, const char *signal) {
         }
     }
     return false;
+}
+
+int pins_of_converter(unsigned converter, unsigned channel) {
+    static int pins[CONVERTERS][CHANNELS];
+    static bool found;
+    if (!found) {
+        memset(pins, 0xFF, sizeof pins);
+        for (const pin_row_t *row = pins_first(); row < pins_end(); ++row) {
+            if (strncmp(row->peripheral, "ADC", 3) == 0 && strncmp(row->signal, "IN", 2) == 0 &&
+                row->signal[2] != 'N') {
+                pins[row->peripheral[3] - '1'][strtoul(row->signal + 2, NULL, 10)] = (int)row->pin;
+            }
+        }
+        found = true;
+    }
+    return channel < CHANNELS ? pins[converter][channel] : -1;
 }

@@ -58,7 +58,7 @@ void leave(int code) __attribute__((noreturn));
         }                                                                                                              \
     } while (0)
 
-/* What the control interrupt does. */
+/* Work of the control interrupt. */
 typedef enum {
     IDLE,           /* opens all switches */
     FIXED,          /* writes compare values */

@@ -85,8 +85,8 @@ static void turn(uint32_t to) {
 
 static uint32_t samples, latched;
 
-/* What was set in the last period is sampled in this one; the encoder, which has moved since its latch, is read as
- * latched. */
+/* Codes that were set in the last period are sampled in this one; the encoder, which has moved since its latch, is read
+ * as latched. */
 static void sample(hal_t *hal) {
     hal_adc_sample_t made;
     hal_encoder_sample_t encoder;
@@ -103,7 +103,7 @@ static void sample(hal_t *hal) {
         CHECK(encoder.counts == ((latched - origin) & 0xFFFu));
     }
     latched = shaft;
-    if (samples == 80u) { /* the index is passed at a position that is none of a whole turn: the count follows it */
+    if (samples == 80u) { /* the index is passed at a position within the turn: the count follows it */
         mark = (shaft + 12u) & ~3u;
         turn(mark + 6u);
         origin = mark;
@@ -134,13 +134,13 @@ static void late_temperatures(const hal_t *hal) {
 
 #define LATE_PERIODS 40u /* so that some readings meet an update */
 
-static uint32_t lates;
+static uint32_t interrupts_late;
 
 static void late(hal_t *hal) {
-    lates++;
-    if (lates == 1) {
+    interrupts_late++;
+    if (interrupts_late == 1) {
         (void)hal_interrupt_missed_triggers(hal);
-    } else if (lates == 2) {
+    } else if (interrupts_late == 2) {
         CHECK(hal_interrupt_missed_triggers(hal) == 0);
         uint32_t last = 0;
         for (uint32_t ticks = 0; ticks < PERIOD_CYCLES * LATE_PERIODS + PERIOD_CYCLES / 3u;
@@ -148,7 +148,7 @@ static void late(hal_t *hal) {
             CHECK(ticks >= last && ticks - last < 200u + LATENCY_MAX);
             last = ticks;
         }
-    } else if (lates == 3) {
+    } else if (interrupts_late == 3) {
         missed = hal_interrupt_missed_triggers(hal);
     } else {
         CHECK(hal_interrupt_missed_triggers(hal) == 0);

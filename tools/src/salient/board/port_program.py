@@ -22,7 +22,7 @@ MODEL = BUILD / "host" / "bin" / "salient_stm32g4"
 _LIMIT_US = 600_000
 _TIMEOUT_S = 120
 _STEPS = (1, 5, 7, 11, 13, 617, 1009, 1201)
-"""Of the switches lower a to d, upper a to d: step[] of tests/target/stm32g4/port/interrupt.c."""
+"""Steps of the switches lower a to d, upper a to d: step[] of tests/target/stm32g4/port/interrupt.c."""
 
 
 def _run(line: list[str]) -> None:
@@ -82,7 +82,7 @@ def gates() -> list[str]:
 
 
 def verdict(image: Path, clock_mhz: int, model: Path = MODEL) -> str:
-    """What is wrong, "" when nothing is."""
+    """The first complaint, "" when there is none."""
     trace = image.with_suffix(".edges")
     try:
         done = subprocess.run([str(model), str(image), "--alone", "--limit-us", str(_LIMIT_US), "--trace", str(trace),

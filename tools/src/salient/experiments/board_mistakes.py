@@ -118,7 +118,7 @@ def _first_failure(model: Path) -> str:
 
 @cache
 def _kept_folder() -> tempfile.TemporaryDirectory[str]:
-    """Of this process, until it ends."""
+    """A folder of this process, until it ends."""
     return tempfile.TemporaryDirectory(prefix="salient-")
 
 
@@ -133,7 +133,7 @@ def _right_image() -> Path:
 
 
 def look(bug: Bug) -> str:
-    """What finds a mistake: the first complaint, "" when nothing does."""
+    """The first complaint about a mistake, "" when there is none."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         folder = Path(name)
         if of_port(bug):
