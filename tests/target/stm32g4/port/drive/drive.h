@@ -1,4 +1,4 @@
-/* Interface of the drive, as far as the port's start.c needs it; here a program that checks the port takes its place (port.c). */
+/* Interface of the drive, as far as start.c needs it; the program that checks the port takes its place (port.c). */
 #ifndef DRIVE_DRIVE_H
 #define DRIVE_DRIVE_H
 
