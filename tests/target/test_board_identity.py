@@ -1,7 +1,7 @@
 """The image of the board in the model of its part is bit-identical with the host executable of the same clock.
 
 Compared are the recorded true state (currents, flux linkages, speed and torque) and the CAN frames with their times, as
-salient.board.same_bits has them.
+salient.experiments.board_same_bits has them.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from test_same_bits import load_step_150, start_600
 
 from salient.bench import programs
 from salient.bench.drive import DriveError
-from salient.board.same_bits import after_the_first, pair
 from salient.config import CONTROLLERS
+from salient.experiments.board_same_bits import after_the_first, pair
 
 CLOCKS = (programs.BOARD_CLOCK_MHZ, pytest.param(170, marks=pytest.mark.in_turns))
 """Clocks of the processor and the PWM timer: whole nanoseconds a tick, and the board's own, a tick of 5.88 ns."""

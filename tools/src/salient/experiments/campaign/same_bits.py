@@ -8,7 +8,7 @@ when any differ.
 
 On stm32g4, the board's image in the register-level model of its part, the machines have the board's converters,
 encoder, control rate and clock, and the frames of a seed's clients meet an image and a host executable of that clock:
-compared are their frames and the true state (salient.board.same_bits). Seeds of machines that the board cannot drive
+compared are their frames and the true state (salient.experiments.board_same_bits). Seeds of machines that the board cannot drive
 are left out.
 """
 
@@ -34,7 +34,7 @@ def hashes(task: tuple[int, str]) -> dict[str, Any]:
     """Hashes of a seed, one for each run; task: seed, target. For workers."""
     seed, target = task
     if target == BOARD_BUILD:
-        from salient.board.same_bits import board_hashes  # builds an image
+        from salient.experiments.board_same_bits import board_hashes  # builds an image
 
         return board_hashes(seed)
     first = str(run_world(seed).get("hash", "crash"))
