@@ -53,7 +53,7 @@ def start_again(bench, speed_rpm: float) -> None:
 
 
 def faults(bench) -> list[object]:
-    """Each line of STO, a bus that is off and free again, late interrupts: causes of the faults, and the speed after."""
+    """Each line of STO, a bus that is off and free again, late interrupts: causes of the faults, the speed after."""
     seen: list[object] = []
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.05)

@@ -8,8 +8,8 @@ when any differ.
 
 On stm32g4, the board's image in the register-level model of its part, the machines have the board's converters,
 encoder, control rate and clock, and the frames of a seed's clients meet an image and a host executable of that clock:
-compared are their frames and the true state (salient.experiments.board_same_bits). Seeds of machines that the board cannot drive
-are left out.
+compared are their frames and the true state (salient.experiments.board_same_bits). Seeds of machines that the board
+cannot drive are left out.
 """
 
 from __future__ import annotations
