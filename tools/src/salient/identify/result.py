@@ -246,7 +246,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         converter |= {"switch_drop_V": round(fit.drop_V, 4), "diode_drop_V": round(fit.drop_V, 4)}
     converter["supply_voltage_V"] = round(result.supply_V, 1)
     drive = {name: value for name, value in plate.get("drive", {}).items() if name != "parameters"}
-    drive |= {**board, "current_peak_A": float(f"{_peak_A(result):.6g}")}
+    drive |= {**board, "current_peak_A": _downwards(_peak_A(result))}
     resistance = fit.resistance_ohm - of_devices
     if resistance <= 0.0:
         raise IdentifyError(f"resistance {fit.resistance_ohm:.4g} ohm: less than that of the devices, {of_devices:.4g}")
@@ -264,6 +264,12 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         tables["drive.parameters"] = plate["drive"]["parameters"]
     return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
                         path.stem, tables)
+
+
+def _downwards(value: float) -> float:
+    """With six digits, and not above the largest current of the map."""
+    digit = 10.0 ** (math.floor(math.log10(value)) - 5)
+    return float(f"{math.floor(value / digit * (1.0 + 1e-12)) * digit:.6g}")
 
 
 def machine_text(about: str, name: str, tables: Mapping[str, Mapping[str, Any]]) -> str:

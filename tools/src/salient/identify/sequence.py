@@ -34,10 +34,12 @@ _FREEWHEEL_MS = 50
 _LATENCY_S = 2.5e-3
 _SLOW, _SLOWEST, _FASTEST = 0.2, 0.7, 1.2
 """Parts of the drift speed: below the first the rotor stands, between the others it is kept."""
-_PATIENCE_S, _PATIENCE_LOADED_S = 0.05, 0.01
-"""Wait for a window that is worth one pulse more of it; also while a load changes the speed."""
-_LOSS_PART, _ENOUGH = 0.65, 0.95
-"""Part of the copper loss that the drive permits, at which the map ends, and of the windows that it needs."""
+_PULSE_S = 0.02
+"""Time in which the bus takes the records of a pulse."""
+_SIDE_PART = 0.25
+"""Least part of the pulses of a phase that are of either side of its aligned position."""
+_LOSS_PART = 0.65
+"""Part of the copper loss that the drive permits, at which the map ends."""
 _SPIN_UP_MAX_S, _COAST_S, _COAST_STEP_S = 2.5, 1.0, 0.01
 _REST_S, _REST_LOADED_S = 0.02, 0.005
 _DRIFT_LOADED_S = 0.03
@@ -46,6 +48,7 @@ _PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 1.5, 6, 3.0
 """Electrical periods and pulses of each phase that show the inductances of a turning rotor; at most that long."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
 """Duration of a push; at most that part of an electrical period, so that its torque keeps its sign."""
+_UNMOVED_MAX = 40
 _SMALL_PART = 0.2
 """Current at which no iron is saturated, of the limit."""
 _PLACES = 24
@@ -96,6 +99,8 @@ class Sequence:
         """Acceleration by a load that turns the rotor, rev/s^2; 0 of a rotor that stays where it is."""
         self._pushed: int | None = None
         """Phase of the last push, whose current may not have ended."""
+        self._from, self._unmoved = 0.0, 0
+        """Angle at which the last push began, rev; pushes that have not moved the rotor from there."""
 
     # --- rest, windings -------------------------------------------------------------------------------------------
 
@@ -226,15 +231,20 @@ class Sequence:
 
     def _settle(self, phase: int) -> tuple[float, float]:
         """Where a phase holds the rotor, and how far that was, rev."""
-        turns = self._hold(phase, _HOLD_S, None)
-        while len(turns) * HOLD_RECORD_S < _HOLD_MAX_S and np.ptp(turns) >= _STILL and len(turning_points(turns)) < 3:
-            turns = np.concatenate([turns, self._hold(phase, _HOLD_S, None)])
-        moved, span_s = float(np.ptp(turns)), max(len(turns) * HOLD_RECORD_S, 0.1)
         quiet = _QUIET / self.found.rotor_poles
+        turns = last = self._hold(phase, _HOLD_S, None)
+        while (len(turns) * HOLD_RECORD_S < _HOLD_MAX_S and np.ptp(turns) >= _STILL and np.ptp(last) >= quiet
+               and len(turning_points(turns)) < 3):
+            last = self._hold(phase, _HOLD_S, None)
+            turns = np.concatenate([turns, last])
+        moved, span_s = float(np.ptp(turns)), max(len(turns) * HOLD_RECORD_S, 0.1)
         for _ in range(_DAMPED_MAX):
             if np.ptp(turns[len(turns) // 2:]) < quiet:
                 break
             turns = self._hold(phase, max(0.5 * span_s, 0.15), centre_of(turns))
+        turns = self._hold(phase, _HOLD_S, None)  # friction may have stopped it anywhere, with a quarter of the current
+        if np.ptp(turns) >= quiet:
+            return centre_of(turns), moved
         tail = turns[len(turns) // 2:]
         return float((tail.max() + tail.min()) / 2.0), moved
 
@@ -274,7 +284,12 @@ class Sequence:
         found = self.found
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
         at = turn + speed * (_LATENCY_S + duration_s) / 2.0
-        phase = max(found.phases, key=lambda each: -direction * math.sin(2.0 * math.pi * found.electrical(each, at)))
+        ranked = sorted(found.phases, key=lambda each: -direction * pull(found.electrical(each, at)))
+        self._unmoved = self._unmoved + 1 if abs(speed) < _SLOW * self._drift and abs(turn - self._from) < _STILL else 0
+        if self._unmoved > _UNMOVED_MAX:
+            raise IdentifyError("no phase can move the rotor")
+        self._from = turn
+        phase = ranked[self._unmoved // 2 % 2]  # one whose torque is less than its friction may be followed by another
         if found.wired_us and speed * direction > -0.5 * self._drift:  # the shaft is found by the records; but first
             self._end_push(phase)  # a rotor that the load turns away has to be caught
         self._pushed = phase
@@ -287,8 +302,8 @@ class Sequence:
             self._pushed = None
 
     def map(self, bins: int, repeats: int, max_s: float) -> None:
-        """Pulses until each window of each phase has had `repeats`, or for max_s. IdentifyError: the rotor cannot be
-        kept turning."""
+        """Pulses until each window has had `repeats` of each phase and side on the mean, or for max_s, or until the
+        windings have had most of their copper loss. IdentifyError: the rotor cannot be kept turning."""
         found, link = self.found, self.link
         star = self._drift
         self.tell(f"drift at about {60 * star:.0f} r/min: pulses to the limit from {bins} windows of each phase, "
@@ -297,14 +312,12 @@ class Sequence:
         begin_s, told_s = link.time_s, link.time_s
         log = link.rest(0.01)
         direction = self._against_load
-        while counts.min() < repeats and link.time_s - begin_s < max_s:
+        while not covered(counts, repeats) and link.time_s - begin_s < max_s:
             speed, turn = self._motion(log)
             if abs(speed) > 0.05 * star and not self._load:
                 direction = 1 if speed > 0 else -1
             drives = self._drives(speed * direction / star)
-            slow = abs(speed) < _SLOW * star
-            lacks = slow or (drives and self._lacks_braking(counts, direction))
-            if drives if self._load else lacks:
+            if drives if self._load else abs(speed) < _SLOW * star:
                 log = self._push(direction, speed, turn)
                 continue
             self._end_push()
@@ -323,11 +336,13 @@ class Sequence:
             log = log if len(log) > 4 else link.rest(0.003)
             if link.time_s - told_s > 2.0:
                 told_s = link.time_s
-                if link.loss_part(found.phases) > _LOSS_PART and np.mean(counts > 0) > _ENOUGH:
+                loss = link.loss_part(found.phases)
+                if loss > _LOSS_PART:
                     self.tell("  the windings have had most of their copper loss: the map ends here")
                     break
-                self.tell(f"  {counts.clip(max=repeats).sum()} of {counts.size * repeats} windows, "
-                          f"{60 * speed:+.0f} r/min")
+                wanted = counts.size * repeats
+                self.tell(f"  {folded(counts).clip(max=2 * len(counts) * repeats).sum()} of {wanted} pulses, "
+                          f"{60 * speed:+.0f} r/min, {loss:.0%} of the permitted copper loss")
         found.mapped_us = int(link.log["time_us"][-1])
         self._refine()
 
@@ -361,14 +376,6 @@ class Sequence:
             self._driving = speed < slowest
         return self._driving
 
-    @staticmethod
-    def _lacks_braking(counts: np.ndarray, direction: int) -> bool:
-        """The windows whose torque drives have had their pulses, those whose torque brakes have not: speed is needed
-        for them, and no further pulse of a certain window."""
-        bins = counts.shape[1]
-        half = slice(bins // 2, bins) if direction > 0 else slice(0, bins // 2)
-        return bool(counts[:, half].min() >= counts.mean() - 0.5)
-
     def _windowed(self, phase: int, window: int, bins: int, turn: float, direction: int) -> Experiment:
         """A pulse at the next passage of a window: its begin in the direction of counting."""
         found = self.found
@@ -390,8 +397,9 @@ class Sequence:
     def _choose(self, counts: np.ndarray, star: float, speed: float, turn: float, direction: int, sign: int
                 ) -> tuple[int, int, float] | None:
         """Row and window of the next pulse, and the time to it: of those whose torque has the sign, or of all with a
-        sign of 0, that with few pulses which comes soon."""
+        sign of 0, that whose pulse tells most by its time."""
         found, bins = self.found, counts.shape[1]
+        of_window = folded(counts)
         best: tuple[float, int, int, float] | None = None
         for row, phase in enumerate(found.phases):
             place = found.electrical(phase, turn + speed * _LATENCY_S)
@@ -401,7 +409,9 @@ class Sequence:
                     continue
                 ahead = (direction * (centre - place)) % 1.0
                 arrival_s = ahead / found.rotor_poles / max(abs(speed), _SLOW * star)
-                cost = counts[row, window] + arrival_s / (_PATIENCE_LOADED_S if self._load else _PATIENCE_S)
+                # The variance of a mean of n pulses falls by about 1 / n^2 with one more.
+                had = (1.0 + of_window[min(window, bins - 1 - window)]) ** 2 * (1.0 + counts[row, window])
+                cost = (arrival_s + _PULSE_S) * had
                 if best is None or cost < best[0]:
                     best = (cost, row, window, arrival_s)
         return None if best is None else best[1:]
@@ -439,6 +449,25 @@ class Sequence:
             if -speed * self._against_load > self._drift:
                 break
         return self.link.time_s - begin_s
+
+
+def pull(place: float) -> float:
+    """Torque of a phase by its electrical angle from aligned, rev, roughly: the poles overlap near aligned."""
+    angle = 2.0 * math.pi * place
+    return -math.sin(angle) * (1.5 + math.cos(angle))
+
+
+def folded(counts: np.ndarray) -> np.ndarray:
+    """Pulses by window from aligned to unaligned, of all phases and both sides, which show the same map."""
+    half = (counts.shape[1] + 1) // 2
+    return np.asarray((counts[:, :half] + counts[:, ::-1][:, :half]).sum(axis=0))
+
+
+def covered(counts: np.ndarray, repeats: int) -> bool:
+    """Each window has had its pulses, and each phase some of either side, whose difference shows its angle."""
+    phases, bins = counts.shape
+    sides = np.stack([counts[:, :bins // 2].sum(axis=1), counts[:, bins // 2:].sum(axis=1)])
+    return bool(folded(counts).min() >= 2 * phases * repeats and sides.min() >= _SIDE_PART * bins // 2 * repeats)
 
 
 def inductance_of(log: np.ndarray, small_A: float = math.inf) -> list[tuple[float, float]]:
