@@ -78,6 +78,7 @@ class FluxBasis:
         result = sum(across[:, k] * np.einsum("pc,pc->p", along, of[index[:, k]]) for k in range(4))
         return np.asarray(result).reshape(angle_rad.shape)
 
+    @cached_property
     def roughness(self) -> tuple[np.ndarray, np.ndarray]:
         """Quadratic forms of the second differences over the angle, with its symmetry, and over the current."""
         order = 2

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg, optimize, sparse
 
 from salient.identify.basis import FluxBasis
 from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
@@ -25,13 +25,17 @@ from salient.identify.sequence import Findings, Pulse
 
 ANGLES, CURRENTS = 48, 24
 _ITERATIONS = 5
-_ANGLE_WEIGHT, _CURRENT_WEIGHT = 1e-4, 1e-4
-"""Weights of the roughness, relative to the mean weight of a coefficient."""
+_ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 3e-2), (1e-4, 1e-3, 1e-2)
+"""Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
+predict a pulse best, for a smoother map averages more noise and follows a corner less."""
+_FOLDS = 4
+_EXACT_PART = 0.1
+"""Least part of the residual that is not of the current's noise."""
 _DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
 """Deviations of weak priors, for what a machine may not show."""
 _BEGIN_PART = 0.03
 _MOST = 0.25
-"""Part of the pulses that may end at less than the map."""
+"""Part of the pulses that may end at less than the largest common current."""
 _INITIAL_PART, _LEAST_PART = 0.1, 0.1
 """The least incremental inductance is that part of the one of the unaligned phase, which is read at that part of the
 largest current."""
@@ -69,14 +73,8 @@ def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
     return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def within(rows: Rows, current_A: float) -> Rows:
-    """The rows up to a current."""
-    kept = rows.current_A <= current_A
-    return Rows(*(column[kept] for column in vars(rows).values()))
-
-
 def common_current_A(pulses: Sequence[Pulse]) -> float:
-    """Largest current of most pulses; beyond, only some angles would have samples."""
+    """Largest current of most pulses."""
     return float(np.quantile([pulse.log["current_A"].max() for pulse in pulses if pulse.mapped], _MOST))
 
 
@@ -112,7 +110,8 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
 @dataclass
 class Fit:
     """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
-    device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest."""
+    device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest;
+    smoothness: weights of the roughness over angle and current."""
 
     basis: FluxBasis
     coefficients: np.ndarray
@@ -123,6 +122,7 @@ class Fit:
     delay_s: float
     offset_A: np.ndarray
     residual_Wb: np.ndarray
+    smoothness: tuple[float, float] = (1e-3, 1e-3)
 
     def flux_Wb(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
         """Flux linkage at an angle from aligned."""
@@ -144,10 +144,37 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
     basis = FluxBasis(rotor_poles, current_max_A, angles, currents)
     fit = Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
               np.zeros(0))
-    rough = basis.roughness()
     for iteration in range(_ITERATIONS):
-        fit = _solution(_problem(rows, phases, fit, rough, linear=iteration == 0), rows, phases)
+        problem = _problem(rows, phases, fit, linear=iteration == 0)
+        if iteration == 1:
+            fit = replace(fit, smoothness=_smoothness(problem, rows))
+            problem = _problem(rows, phases, fit, linear=False)
+        fit = _solution(problem, rows, phases)
     return fit
+
+
+def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
+    """Weights of the roughness by prediction of each pulse from those of other folds, of the linear problem."""
+    n = problem.fit.basis.size
+    folds = []
+    for fold in range(_FOLDS):
+        kept = rows.pulse % _FOLDS == fold
+        design, weights, flux = problem.design[kept], problem.weights[kept], rows.flux_Wb[kept]
+        weighted = design.multiply(weights[:, None]).tocsr()
+        folds.append((design, weights, flux, (weighted.T @ design).toarray(), weighted.T @ flux))
+    normal, right = sum(each[3] for each in folds), sum(each[4] for each in folds)
+    best = (math.inf, problem.fit.smoothness)
+    for by_angle in _ANGLE_WEIGHTS:
+        for by_current in _CURRENT_WEIGHTS:
+            forms = _forms(problem, (by_angle, by_current))
+            error = 0.0
+            for design, weights, flux, of_normal, of_right in folds:
+                other = normal - of_normal + np.diag(problem.ridge)
+                other[:n, :n] += forms
+                x = linalg.solve(other, right - of_right + problem.pull, assume_a="pos", check_finite=False)
+                error += float(weights @ (flux - design @ x)**2)
+            best = min(best, (error, (by_angle, by_current)))
+    return best[1]
 
 
 def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -159,14 +186,15 @@ def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Problem:
-    """A least-squares problem about a fit. forms: of the roughness, weighted; known, deviations: of the priors of the
-    further columns."""
+    """A least-squares problem about a fit. weights: of the rows, 1 on the mean; scale: mean weight of a coefficient;
+    ridge, pull: of the priors of the further columns, diagonal and right-hand side."""
 
     fit: Fit
     design: sparse.csr_matrix
-    forms: np.ndarray
-    known: np.ndarray
-    deviations: np.ndarray
+    weights: np.ndarray
+    scale: float
+    ridge: np.ndarray
+    pull: np.ndarray
     linear: bool
     signs: sparse.csr_matrix
     least: np.ndarray
@@ -182,15 +210,34 @@ def _signs(basis: FluxBasis) -> sparse.csr_matrix:
     return sparse.vstack([rises, falls]).tocsr()
 
 
-def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndarray], linear: bool) -> _Problem:
+def _forms(problem: _Problem, smoothness: tuple[float, float]) -> np.ndarray:
+    """Quadratic form of the roughness of a map."""
+    by_angle, by_current = problem.fit.basis.roughness
+    return np.asarray(problem.scale * (smoothness[0] * by_angle + smoothness[1] * by_current
+                                       + 1e-12 * np.eye(problem.fit.basis.size)))
+
+
+def _weights(rows: Rows, fit: Fit, by_current: np.ndarray) -> np.ndarray:
+    """Weights of the rows by their variance: of the current's noise times the incremental inductance, and a constant
+    one; both by the residuals."""
+    square, of_current = fit.residual_Wb**2, by_current**2
+    of_current /= of_current.mean()
+    parts = optimize.nnls(np.column_stack([np.ones(len(square)), of_current]), square)[0]
+    variance = max(parts[0], _EXACT_PART * float(square.mean()), 1e-300) + parts[1] * of_current
+    return np.asarray(1.0 / variance / np.mean(1.0 / variance))
+
+
+def _problem(rows: Rows, phases: int, fit: Fit, linear: bool) -> _Problem:
     """About the present angles, delay and offsets unless `linear`."""
     basis, n = fit.basis, fit.basis.size
     angle, current = _corrected(rows, fit)
     columns = [rows.charge_As, 2.0 * rows.time_s]
     deviations, known = [math.inf, _DROP_V], [0.0, 0.0]
+    weights = np.ones(len(rows.row))
     if not linear:
         by_angle = basis.value(fit.coefficients, angle, current, 1, 0)
         by_current = basis.value(fit.coefficients, angle, current, 0, 1)
+        weights = _weights(rows, fit, by_current)
         of_phase = [(rows.row == row).astype(float) for row in range(phases)]
         columns += [-by_angle * each for each in of_phase]
         columns += [-by_angle * np.cos(rows.shaft_rad), -by_angle * np.sin(rows.shaft_rad), by_current * rows.slope_A_s]
@@ -199,34 +246,35 @@ def _problem(rows: Rows, phases: int, fit: Fit, rough: tuple[np.ndarray, np.ndar
         deviations += [_OFFSET_PART * basis.current_max_A] * phases
         known += [0.0] * phases + [*-fit.eccentricity_rad, -fit.delay_s, *-fit.offset_A]
     design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
-    scale = float(design[:, :n].multiply(design[:, :n]).sum()) / n
-    forms = scale * (_ANGLE_WEIGHT * rough[0] + _CURRENT_WEIGHT * rough[1] + 1e-12 * np.eye(n))
+    scale = float(weights @ design[:, :n].multiply(design[:, :n]).sum(axis=1).A1) / n
+    noise = float(np.mean(weights * fit.residual_Wb**2)) if not linear else \
+        (2e-4 * float(np.abs(rows.flux_Wb).max())) ** 2
+    square = design[:, n:].multiply(design[:, n:]).sum(axis=0).A1
+    ridge, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
+    ridge[n:] = np.where(np.isinf(deviations), 1e-12 * square, noise / np.square(deviations))
+    pull[n:] = np.where(np.isinf(deviations), 0.0, known * ridge[n:])
     signs = _signs(basis)
     least = np.zeros(signs.shape[0])
     if not linear:
         unaligned = float(basis.value(fit.coefficients, np.array(math.pi / basis.rotor_poles),
                                       np.array(_INITIAL_PART * basis.current_max_A))) / _INITIAL_PART
         least[:basis.rows * basis.columns] = _LEAST_PART * max(unaligned, 0.0)
-    return _Problem(fit, design, forms, np.array(known), np.array(deviations), linear, signs, least)
+    return _Problem(fit, design, weights, scale, ridge, pull, linear, signs, least)
 
 
-def _solution(problem: _Problem, rows: Rows, phases: int, weights: np.ndarray | None = None) -> Fit:
-    """The fit of a problem, with a weight of each row. IdentifyError: the pulses do not determine the machine."""
+def _solution(problem: _Problem, rows: Rows, phases: int, drawn: np.ndarray | None = None) -> Fit:
+    """The fit of a problem, with a number of each row. IdentifyError: the pulses do not determine the machine."""
     fit, design = problem.fit, problem.design
     n = fit.basis.size
-    weighted = design if weights is None else design.multiply(weights[:, None]).tocsr()
-    normal, right = (weighted.T @ design).toarray(), weighted.T @ rows.flux_Wb
-    normal[:n, :n] += problem.forms
-    noise = float(np.mean(fit.residual_Wb**2)) if len(fit.residual_Wb) == len(rows.flux_Wb) else \
-        (2e-4 * float(np.abs(rows.flux_Wb).max())) ** 2
-    for k, deviation in enumerate(problem.deviations, start=n):
-        normal[k, k] += 1e-12 * normal[k, k] if math.isinf(deviation) else noise / deviation**2
-        right[k] += 0.0 if math.isinf(deviation) else problem.known[k - n] * noise / deviation**2
+    weights = problem.weights if drawn is None else problem.weights * drawn
+    weighted = design.multiply(weights[:, None]).tocsr()
+    normal, right = (weighted.T @ design).toarray() + np.diag(problem.ridge), weighted.T @ rows.flux_Wb + problem.pull
+    normal[:n, :n] += _forms(problem, fit.smoothness)
     x = _constrained(problem, normal, right, n)
     more = np.zeros(2 * phases + 3) if problem.linear else x[n + 2:]
     return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
                fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
-               fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x)
+               fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x, fit.smoothness)
 
 
 def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
@@ -255,7 +303,7 @@ def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: in
 def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:
     """The fit of pulses drawn with repetition, once in each sample: it scatters as the result does, whatever
     correlates the rows of a pulse."""
-    problem = _problem(rows, phases, fit, fit.basis.roughness(), linear=False)
+    problem = _problem(rows, phases, fit, linear=False)
     random = np.random.default_rng(seed)
     pulses = int(rows.pulse.max()) + 1
     return [_solution(problem, rows, phases, random.multinomial(pulses, np.full(pulses, 1.0 / pulses))[rows.pulse]

@@ -33,8 +33,10 @@ _LEAST_SLOPE = 0.1
 """Least incremental inductance by the one of the unaligned phase, as in the fit."""
 _FLAT_RESISTANCE, _FLAT_INERTIA, _FLAT_ANGLE_DEG, _FLAT_FLUX = 0.005, 0.02, 0.02, 0.001
 """Half widths of intervals up to which a quantity counts as determined."""
-_NEAR_LIMIT = 0.9
-"""Largest current of the pulses, part of the limit, from which the map is continued to it; else it ends there."""
+_NEAR_LIMIT = 0.8
+"""Largest current of most pulses, part of the limit, from which the map goes to it; else it ends there."""
+_EVENINGS = 6
+"""Means over neighbouring currents until the loader's curve through the points rises everywhere."""
 _MODEL_PART = 0.0025
 """Part by which inertia and friction are wrong without any noise (salient.experiments.identified); cause not known."""
 NOT_OBSERVABLE = (
@@ -93,8 +95,9 @@ class Result:
 def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = SAMPLES) -> Result:
     """The machine by the experiments. IdentifyError: they do not determine it."""
     pulses = [pulse for pulse in found.pulses if pulse.log["time_us"][-1] <= found.mapped_us]
-    phases, largest_A = len(found.phases), electrical.common_current_A(pulses)
-    rows = electrical.within(electrical.rows_of(found, pulses), largest_A)
+    phases, common_A = len(found.phases), electrical.common_current_A(pulses)
+    largest_A = limit_A if common_A >= _NEAR_LIMIT * limit_A else common_A
+    rows = electrical.rows_of(found, pulses)
     fit = electrical.solve(rows, phases, found.rotor_poles, largest_A)
     others = electrical.resampled(rows, phases, fit, samples)
     shaft = shaft_of(found, fit, log)
@@ -200,42 +203,39 @@ def write_machine(result: Result, plate: Path, path: Path) -> Machine:
     board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
     text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine, board, path)
     table = path.with_suffix(".csv")
-    lines = ["# measured by the drive: tools/salient identify", "angle_deg,current_A,flux_linkage_Wb"]
-    angle, current, flux = _to_limit(result)
-    lines += [f"{math.degrees(each[0]):.9g},{each[1]:.9g},{each[2]:.9g}" for each in
-              zip(angle.ravel(), current.ravel(), flux.ravel(), strict=True)]
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # both files come into their place whole, or none does
         staged = Path(folder) / path.name
-        staged.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
         staged.write_text(text, encoding="utf-8")
-        try:
-            load_machine(staged)
-            scaling_of(path, load_machine(staged))
-        except MachineError as error:
-            reason = str(error).removeprefix(f"{staged}: ")
-            raise IdentifyError(f"the measured machine is refused: {reason}") from None
+        flux_Wb = result.flux_Wb
+        for evenings in range(_EVENINGS + 1):
+            staged.with_suffix(".csv").write_text(_map_text(result, flux_Wb), encoding="utf-8")
+            try:
+                load_machine(staged)
+                scaling_of(path, load_machine(staged))
+                break
+            except MachineError as error:
+                if evenings == _EVENINGS:
+                    reason = str(error).removeprefix(f"{staged}: ")
+                    raise IdentifyError(f"the measured machine is refused: {reason}") from None
+            flux_Wb = evened(flux_Wb)
         staged.with_suffix(".csv").replace(table)
         staged.replace(path)
     return load_machine(path)
 
 
-def _peak_A(result: Result) -> float:
-    largest_A = float(result.current_A[0, -1])
-    return result.limit_A if largest_A >= _NEAR_LIMIT * result.limit_A else largest_A
+def _map_text(result: Result, flux_Wb: np.ndarray) -> str:
+    lines = ["# measured by the drive: tools/salient identify", "angle_deg,current_A,flux_linkage_Wb"]
+    lines += [f"{math.degrees(each[0]):.9g},{each[1]:.9g},{each[2]:.9g}" for each in
+              zip(result.angle_rad.ravel(), result.current_A.ravel(), flux_Wb.ravel(), strict=True)]
+    return "\n".join(lines) + "\n"
 
 
-def _to_limit(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angles, currents, flux linkages of the map; the little from the largest current of the pulses to the limit with
-    the last slope."""
-    angle, current, flux = result.angle_rad, result.current_A, result.flux_Wb
-    largest_A = float(current[0, -1])
-    if not _NEAR_LIMIT * result.limit_A <= largest_A < result.limit_A:
-        return angle, current, flux
-    slope = (flux[:, -1] - flux[:, -3]) / (current[:, -1] - current[:, -3])
-    more = flux[:, -1] + slope * (result.limit_A - largest_A)
-    return (np.hstack([angle, angle[:, -1:]]), np.hstack([current, np.full((len(current), 1), result.limit_A)]),
-            rising(np.hstack([flux, more[:, None]])))
+def evened(flux_Wb: np.ndarray) -> np.ndarray:
+    """A map whose rises over the current are means of their neighbours, weighted 1 2 1."""
+    rises = np.diff(flux_Wb, axis=1, prepend=0.0)
+    padded = np.hstack([rises[:, :1], rises, rises[:, -1:]])
+    return np.asarray(np.cumsum((padded[:, :-2] + 2.0 * padded[:, 1:-1] + padded[:, 2:]) / 4.0, axis=1))
 
 
 def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:
@@ -246,7 +246,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         converter |= {"switch_drop_V": round(fit.drop_V, 4), "diode_drop_V": round(fit.drop_V, 4)}
     converter["supply_voltage_V"] = round(result.supply_V, 1)
     drive = {name: value for name, value in plate.get("drive", {}).items() if name != "parameters"}
-    drive |= {**board, "current_peak_A": _downwards(_peak_A(result))}
+    drive |= {**board, "current_peak_A": _downwards(float(result.current_A[0, -1]))}
     resistance = fit.resistance_ohm - of_devices
     if resistance <= 0.0:
         raise IdentifyError(f"resistance {fit.resistance_ohm:.4g} ohm: less than that of the devices, {of_devices:.4g}")
