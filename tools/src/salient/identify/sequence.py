@@ -14,8 +14,9 @@ keep the speed of all that follows, and coasting is through standstill.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,13 +45,18 @@ _SPIN_UP_MAX_S, _COAST_S, _COAST_STEP_S = 2.5, 1.0, 0.01
 _REST_S, _REST_LOADED_S = 0.02, 0.005
 _DRIFT_LOADED_S = 0.03
 """Time in which a load would stop the drifting rotor, at least."""
-_PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 1.5, 6, 3.0
-"""Electrical periods and pulses of each phase that show the inductances of a turning rotor; at most that long."""
+_PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 0.5, 3, 3.0
+"""Electrical periods and pulses of each phase that show the inductances of a turning rotor, at least; at most that
+long."""
+_CLEARER = 4.0
+"""Sum of squares of the second best order of the phases by the one of the best, from which that is believed."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
 """Duration of a push; at most that part of an electrical period, so that its torque keeps its sign."""
 _UNMOVED_MAX = 40
 _SMALL_PART = 0.2
 """Current at which no iron is saturated, of the limit."""
+_REFINED = 6
+"""Pulses of a phase that show where it is aligned, at least."""
 _PLACES = 24
 """Places in an electrical period whose mean inductances count alike."""
 _LEAST_SALIENCY = 0.2
@@ -97,6 +103,8 @@ class Sequence:
         self._driving = True
         self._load = 0.0
         """Acceleration by a load that turns the rotor, rev/s^2; 0 of a rotor that stays where it is."""
+        self._wound: dict[int, np.ndarray] = {}
+        """Records of the pulses that showed the windings, by phase."""
         self._pushed: int | None = None
         """Phase of the last push, whose current may not have ended."""
         self._from, self._unmoved = 0.0, 0
@@ -119,6 +127,7 @@ class Sequence:
             log = self._pulse(Experiment("pulse", phase, PROBE_LEVEL), keep=False)
             if log["current_A"].max() > 0.3 * PROBE_LEVEL * self.link.limit_A:
                 self.found.phases.append(phase)
+            self._wound[phase] = log
         if len(self.found.phases) < self._phases:
             missing = ", ".join("abcdef"[phase] for phase in range(self._phases) if phase not in self.found.phases)
             raise IdentifyError(f"phase {missing}: no current at full voltage: no winding, or no switch")
@@ -178,20 +187,43 @@ class Sequence:
         self.tell(f"a load turns the rotor, {60.0 * self._load:+.0f} r/min a second: small pulses show the inductances "
                   "by the angle: order, direction, angles")
         small_A = _SMALL_PART * link.limit_A
-        shown: dict[int, list[tuple[float, float]]] = {phase: [] for phase in found.phases}
-        begin, begin_s, level = float(link.log["turn"][-1]), link.time_s, PROBE_LEVEL
-        while level == PROBE_LEVEL or min(map(len, shown.values())) < _PROBES:
+        shown = {phase: inductance_of(log, small_A) for phase, log in self._wound.items()}
+        begin, begin_s = float(next(iter(self._wound.values()))["turn"][0]), link.time_s
+        levels = dict.fromkeys(found.phases, PROBE_LEVEL)
+        while (abs(float(link.log["turn"][-1]) - begin) * found.rotor_poles < _PROBE_PERIODS
+               or min(map(len, shown.values())) < _PROBES or (places := self._places(shown)) is None):
             if link.time_s - begin_s > _PROBE_MAX_S:
-                raise IdentifyError("a load turns the rotor, but too slowly to show its poles")
+                raise IdentifyError("a load turns the rotor, but the inductances do not show its poles: they turn too "
+                                    f"slowly, or are not {found.rotor_poles}")
             for phase in found.phases:
-                shown[phase] += inductance_of(self._pulse(Experiment("pulse", phase, level), keep=False), small_A)
-            if abs(float(link.log["turn"][-1]) - begin) * found.rotor_poles > _PROBE_PERIODS:
-                level = TURNING_LEVEL  # where even a period at full voltage is too long for the smaller one
-        self._order([self._aligned(phase, shown[phase]) for phase in found.phases])
+                seen = inductance_of(self._pulse(Experiment("pulse", phase, levels[phase]), keep=False), small_A)
+                shown[phase] += seen
+                if not seen:
+                    levels[phase] = TURNING_LEVEL  # a period at full voltage is too long for the smaller one
+        self._order(places)
         for phase in found.phases:
             self._resistance(phase)
         self._settle_speed()
         found.wired_us = int(link.log["time_us"][-1])
+
+    def _places(self, shown: Mapping[int, Collection[tuple[float, float]]]) -> list[float] | None:
+        """Positions of the phases by the first harmonic of their inductances, rev, in the order that explains these
+        best; None while another one does nearly as well."""
+        found, poles = self.found, self.found.rotor_poles
+        turn, inductance = np.array([each for phase in found.phases for each in shown[phase]]).T
+        row = np.repeat(np.arange(len(found.phases)), [len(shown[phase]) for phase in found.phases])
+        fits = []
+        for others in itertools.permutations(range(1, len(found.phases))):
+            strokes = np.array([0, *others]) / len(found.phases)
+            angle = 2.0 * math.pi * (poles * turn - strokes[row])
+            design = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+            x = np.linalg.lstsq(design, inductance, rcond=None)[0]
+            fits.append((float(np.sum((inductance - design @ x) ** 2)), strokes, x))
+        fits.sort(key=lambda each: each[0])
+        _, strokes, (mean, cosine, sine) = fits[0]
+        if fits[1][0] < _CLEARER * fits[0][0] or math.hypot(cosine, sine) < _LEAST_SALIENCY * mean:
+            return None
+        return [float(math.atan2(sine, cosine) / (2.0 * math.pi) + stroke) / poles for stroke in strokes]
 
     def _refine(self) -> None:
         """Angles of the phases by the first rise of all pulses of the map: friction or a load keeps a held rotor from
@@ -205,7 +237,7 @@ class Sequence:
 
     def _aligned(self, phase: int, shown: Collection[tuple[float, float]]) -> float:
         """Where the inductance of a phase is largest, rev, by its first harmonic. IdentifyError: it does not vary."""
-        if len(shown) < _PROBES:
+        if len(shown) < _REFINED:
             raise IdentifyError(f"phase {'abcdef'[phase]}: no rise of the current to see its inductance by")
         turn, inductance = np.array(list(shown)).T
         place = np.round(turn * self.found.rotor_poles * _PLACES) % _PLACES
@@ -283,7 +315,7 @@ class Sequence:
         are few, while a pulse's keep the bus busy for longer than it lasts."""
         found = self.found
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
-        at = turn + speed * (_LATENCY_S + duration_s) / 2.0
+        at = turn + speed * (_LATENCY_S + duration_s / 2.0)
         ranked = sorted(found.phases, key=lambda each: -direction * pull(found.electrical(each, at)))
         self._unmoved = self._unmoved + 1 if abs(speed) < _SLOW * self._drift and abs(turn - self._from) < _STILL else 0
         if self._unmoved > _UNMOVED_MAX:
