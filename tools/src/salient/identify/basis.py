@@ -80,8 +80,8 @@ class FluxBasis:
 
     @cached_property
     def roughness(self) -> tuple[np.ndarray, np.ndarray]:
-        """Quadratic forms of the second differences over the angle, with its symmetry, and over the current."""
-        order = 2
+        """Quadratic forms of the third differences over the angle, with its symmetry, and over the current."""
+        order = 3
         mirrored = np.zeros((self.rows + 2 * order, self.rows))
         for row in range(self.rows + 2 * order):
             at = abs(row - order)

@@ -19,7 +19,7 @@ from salient.machine.file import Machine, load_machine
 from salient.machine.path import machine_path
 from salient.paths import make_folder
 
-MAP_MAX_S, SPIN_RPM_OF_DRIFT = 40.0, 8.0
+MAP_MAX_S, SPIN_RPM_OF_DRIFT = 22.0, 8.0
 TELEMETRY_PERIOD_MS = 20
 
 

@@ -25,7 +25,7 @@ from salient.identify.sequence import Findings, Pulse
 
 ANGLES, CURRENTS = 48, 24
 _ITERATIONS = 5
-_ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 3e-2), (1e-4, 1e-3, 1e-2)
+_ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1), (1e-4, 1e-3, 1e-2, 0.1)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
 _FOLDS = 4

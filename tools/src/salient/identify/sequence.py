@@ -39,6 +39,8 @@ _PULSE_S = 0.02
 """Time in which the bus takes the records of a pulse."""
 _SIDE_PART = 0.25
 """Least part of the pulses of a phase that are of either side of its aligned position."""
+_NOISY_PART, _AVERAGED, _AVERAGED_S = 2.5e-4, 2, 16.0
+"""Noise of the currents, part of the limit, from which a map has that many times the pulses, within that time."""
 _LOSS_PART = 0.65
 """Part of the copper loss that the drive permits, at which the map ends."""
 _SPIN_UP_MAX_S, _COAST_S, _COAST_STEP_S = 2.5, 1.0, 0.01
@@ -344,7 +346,9 @@ class Sequence:
         begin_s, told_s = link.time_s, link.time_s
         log = link.rest(0.01)
         direction = self._against_load
-        while not covered(counts, repeats) and link.time_s - begin_s < max_s:
+        noisy = float(found.noise_A.mean()) > _NOISY_PART * link.limit_A
+        while link.time_s - begin_s < max_s and not covered(counts, repeats * (
+                _AVERAGED if noisy and link.time_s - begin_s < _AVERAGED_S else 1)):
             speed, turn = self._motion(log)
             if abs(speed) > 0.05 * star and not self._load:
                 direction = 1 if speed > 0 else -1
@@ -382,7 +386,7 @@ class Sequence:
                  ) -> tuple[int, np.ndarray]:
         """A pulse from a window that has had few; its torque keeps the speed, unless a load brakes. Window and records.
         IdentifyError: the rotor cannot be moved."""
-        sign = 0 if self._load else direction if self._driving else -direction
+        sign = 0 if self._load else lacking_side(counts) or (direction if self._driving else -direction)
         choice = self._choose(counts, star, speed, turn, direction, sign)
         if choice is None:
             raise IdentifyError("no phase can move the rotor")
@@ -493,6 +497,14 @@ def folded(counts: np.ndarray) -> np.ndarray:
     """Pulses by window from aligned to unaligned, of all phases and both sides, which show the same map."""
     half = (counts.shape[1] + 1) // 2
     return np.asarray((counts[:, :half] + counts[:, ::-1][:, :half]).sum(axis=0))
+
+
+def lacking_side(counts: np.ndarray) -> int:
+    """Sign of the torque, in the direction of counting, of the side of aligned that has had too few pulses; 0: none."""
+    half = counts.shape[1] // 2
+    negative, positive = counts[:, :half].sum(), counts[:, half:].sum()
+    least = _SIDE_PART * (negative + positive)
+    return -1 if negative < least - half else 1 if positive < least - half else 0
 
 
 def covered(counts: np.ndarray, repeats: int) -> bool:
