@@ -21,7 +21,9 @@ from salient.identify.sequence import Findings
 
 _STEP_S, _WINDOW_S, _RUN = 0.5e-3, 0.06, 8
 _SAMPLES, _SIGNIFICANT = 200, 3.0
-_SIGN_RAD_S = 0.2
+_SIGN_RAD_S, _SIGN_STEPS = 0.2, 4
+"""Speed that counts as turning, and steps to either side by which it is read: within a window the rotor may turn round,
+or stick."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ def _equations(time_s: np.ndarray, angle: np.ndarray, impulse_s: np.ndarray, imp
     second = (-10.0 * (1.0 - x**2) ** 4 + 80.0 * x**2 * (1.0 - x**2) ** 3) / half_s**2
     second -= second.mean()  # a constant angle or speed has no acceleration, however coarse the sum
     second -= x * (second @ x) / (x @ x)
+    ends = np.pad(theta, _SIGN_STEPS, mode="edge")
+    sign = np.tanh((ends[2 * _SIGN_STEPS:] - ends[:-2 * _SIGN_STEPS]) / (2 * _SIGN_STEPS * _STEP_S) / _SIGN_RAD_S)
     rows, right = [], []
     for begin in range(0, len(grid) - count - 1, count // 4):
         part = theta[begin:begin + count + 1] - theta[begin]
@@ -86,8 +90,8 @@ def _equations(time_s: np.ndarray, angle: np.ndarray, impulse_s: np.ndarray, imp
         at = (impulse_s[near] - middle_s) / half_s
         speed = -float(first @ part) * _STEP_S
         mass = float(phi.sum()) * _STEP_S
-        rows.append([float(((1.0 - at**2) ** 5) @ impulse[near]), -speed, -mass * math.tanh(speed / mass / _SIGN_RAD_S),
-                     -mass])
+        rows.append([float(((1.0 - at**2) ** 5) @ impulse[near]), -speed,
+                     -float(phi @ sign[begin:begin + count + 1]) * _STEP_S, -mass])
         right.append(float(second @ part) * _STEP_S)
     return np.array(rows), np.array(right)
 
