@@ -54,7 +54,8 @@ _CLEARER = 4.0
 """Sum of squares of the second best order of the phases by the one of the best, from which that is believed."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
 """Duration of a push; at most that part of an electrical period, so that its torque keeps its sign."""
-_UNMOVED_MAX = 40
+_UNMOVED_MAX, _PATH = 40, 5
+"""Pushes that have not moved the rotor, at most; places of the rotor in a push by which its phase is chosen."""
 _SMALL_PART = 0.2
 """Current at which no iron is saturated, of the limit."""
 _REFINED = 6
@@ -317,8 +318,9 @@ class Sequence:
         are few, while a pulse's keep the bus busy for longer than it lasts."""
         found = self.found
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
-        at = turn + speed * (_LATENCY_S + duration_s / 2.0)
-        ranked = sorted(found.phases, key=lambda each: -direction * pull(found.electrical(each, at)))
+        path = turn + speed * (_LATENCY_S + np.linspace(0.0, duration_s, _PATH))
+        ranked = sorted(found.phases, key=lambda each: -direction * sum(pull(found.electrical(each, float(at)))
+                                                                        for at in path))
         self._unmoved = self._unmoved + 1 if abs(speed) < _SLOW * self._drift and abs(turn - self._from) < _STILL else 0
         if self._unmoved > _UNMOVED_MAX:
             raise IdentifyError("no phase can move the rotor")
@@ -490,7 +492,7 @@ class Sequence:
 def pull(place: float) -> float:
     """Torque of a phase by its electrical angle from aligned, rev, roughly: the poles overlap near aligned."""
     angle = 2.0 * math.pi * place
-    return -math.sin(angle) * (1.5 + math.cos(angle))
+    return -math.sin(angle) * (2.0 + math.cos(angle))
 
 
 def folded(counts: np.ndarray) -> np.ndarray:
