@@ -28,7 +28,7 @@ _ITERATIONS = 5
 _ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1), (1e-4, 1e-3, 1e-2, 0.1)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
-_FOLDS = 4
+_FOLDS, _ROUGHER = 4, 0.1
 _EXACT_PART = 0.1
 """Least part of the residual that is not of the current's noise."""
 _DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
@@ -298,6 +298,12 @@ def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: in
             return np.asarray(x)
         active |= violated
     return np.asarray(x)
+
+
+def rougher(rows: Rows, phases: int, fit: Fit) -> Fit:
+    """The fit with a tenth of its smoothness: by how much it is another one shows what the smoothness hides."""
+    rough = replace(fit, smoothness=(_ROUGHER * fit.smoothness[0], _ROUGHER * fit.smoothness[1]))
+    return _solution(_problem(rows, phases, rough, linear=False), rows, phases)
 
 
 def resampled(rows: Rows, phases: int, fit: Fit, samples: int, seed: int = 1) -> list[Fit]:
