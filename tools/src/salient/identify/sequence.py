@@ -32,7 +32,8 @@ _QUIET = 0.02
 """Swing that is taken for rest, electrical, of a revolution."""
 _HOLD_S, _HOLD_MAX_S, _DAMPED_MAX = 0.15, 3.0, 12
 _FREEWHEEL_MS = 50
-_LATENCY_S = 2.5e-3
+_LATENCY_S, _LEAD_S = 2.5e-3, 1.25e-3
+"""Time to the begin of an experiment; less for a push, whose current has to end in time."""
 _SLOW, _SLOWEST, _FASTEST = 0.2, 0.7, 1.2
 """Parts of the drift speed: below the first the rotor stands, between the others it is kept."""
 _PULSE_S = 0.02
@@ -44,7 +45,8 @@ _NOISY_PART, _AVERAGED, _AVERAGED_S = 2.5e-4, 2, 16.0
 _LOSS_PART = 0.65
 """Part of the copper loss that the drive permits, at which the map ends."""
 _SPIN_UP_MAX_S, _COAST_S, _COAST_STEP_S = 2.5, 1.0, 0.01
-_REST_S, _REST_LOADED_S = 0.02, 0.005
+_REST_S, _REST_LOADED_S, _REST_MORE_S = 0.02, 0.005, 0.002
+"""Times of rest: without a load, until one is found, and then for each other phase."""
 _DRIFT_LOADED_S = 0.03
 """Time in which a load would stop the drifting rotor, at least."""
 _PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 0.5, 3, 3.0
@@ -119,7 +121,7 @@ class Sequence:
         """Offsets of the sensors by phase, and which phases have a winding. IdentifyError: less than three."""
         self.tell("rest: offsets of the current sensors; a pulse of each phase: which have a winding")
         for phase in range(self._phases):
-            log = self.link.run(Experiment("rest", phase), _REST_LOADED_S)
+            log = self.link.run(Experiment("rest", phase), _REST_MORE_S if self._load else _REST_LOADED_S)
             self._find_load()
             if not self._load:
                 log = np.concatenate([log, self.link.run(Experiment("rest", phase), _REST_S - _REST_LOADED_S)])
@@ -318,7 +320,7 @@ class Sequence:
         are few, while a pulse's keep the bus busy for longer than it lasts."""
         found = self.found
         duration_s = min(_PUSH_S, max(_PUSH_MIN_S, _PUSH_PART / found.rotor_poles / max(abs(speed), 1e-3)))
-        path = turn + speed * (_LATENCY_S + np.linspace(0.0, duration_s, _PATH))
+        path = turn + speed * (_LEAD_S + np.linspace(0.0, duration_s, _PATH))
         ranked = sorted(found.phases, key=lambda each: -direction * sum(pull(found.electrical(each, float(at)))
                                                                         for at in path))
         self._unmoved = self._unmoved + 1 if abs(speed) < _SLOW * self._drift and abs(turn - self._from) < _STILL else 0
