@@ -77,7 +77,7 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings) {
 }
 
 /* value 2^-k for value >= 0, saturates. */
-static int32_t scaled(int32_t value, int32_t k) {
+ALWAYS_INLINE int32_t scaled(int32_t value, int32_t k) {
     if (k >= 0) {
         return value >> k;
     }
