@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from elftools.elf.elffile import ELFFile
-from elftools.elf.sections import SymbolTableSection
+from typing import TYPE_CHECKING, Any
 
 from salient.errors import UsageError
 from salient.paths import BUILD
+
+if TYPE_CHECKING:
+    from elftools.elf.elffile import ELFFile
 
 _ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
 _VARIABLE = b"drive_layout"
@@ -44,6 +44,8 @@ class Layout:
     def __init__(self, program: Path) -> None:
         if not program.exists():
             raise UsageError(f"{program} is missing: cmake --build {program.parent.parent} makes it")
+        from elftools.elf.elffile import ELFFile  # the pytest plugin loads this module where it is not installed
+
         with program.open("rb") as file:
             elf = ELFFile(file)
             found = _find(elf.get_dwarf_info()) if elf.has_dwarf_info() else None
@@ -79,6 +81,8 @@ class Layout:
 
 
 def _word_at(elf: ELFFile, symbol: str) -> int:
+    from elftools.elf.sections import SymbolTableSection
+
     table = elf.get_section_by_name(".symtab")
     for found in (table.get_symbol_by_name(symbol) or ()) if isinstance(table, SymbolTableSection) else ():
         section = elf.get_section(found["st_shndx"])
