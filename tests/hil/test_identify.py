@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from salient.bench.drive import Experiment
 from salient.experiments.identified import CONDITIONS, errors, identified
 from salient.identify.command import identify

@@ -17,7 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, optimize, sparse
+from scipy import linalg, sparse
+from scipy.optimize import nnls
 
 from salient.identify.basis import FluxBasis
 from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
@@ -154,7 +155,7 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
 
 
 def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
-    """Weights of the roughness by prediction of each pulse from those of other folds, of the linear problem."""
+    """Weights of the roughness by prediction of each pulse from the pulses of other folds, of the linear problem."""
     n = problem.fit.basis.size
     folds = []
     for fold in range(_FOLDS):
@@ -222,7 +223,7 @@ def _weights(rows: Rows, fit: Fit, by_current: np.ndarray) -> np.ndarray:
     one; both by the residuals."""
     square, of_current = fit.residual_Wb**2, by_current**2
     of_current /= of_current.mean()
-    parts = optimize.nnls(np.column_stack([np.ones(len(square)), of_current]), square)[0]
+    parts = nnls(np.column_stack([np.ones(len(square)), of_current]), square)[0]
     variance = max(parts[0], _EXACT_PART * float(square.mean()), 1e-300) + parts[1] * of_current
     return np.asarray(1.0 / variance / np.mean(1.0 / variance))
 

@@ -1,7 +1,7 @@
 """The machine that the experiments show, with the uncertainty of each quantity and a verdict on it; and its file.
 
-Intervals are of 95 %, by resampling whole pulses (salient.identify.fit.resampled) or runs of windows (shaft). Those of
-the map also have the difference to a rougher fit. They do not hold what no pulse shows.
+Intervals are of 95 %, by resampling whole pulses (salient.identify.fit.resampled) or runs of windows (shaft). The
+map's also have the difference to a rougher fit. They do not hold what no pulse shows.
 """
 
 from __future__ import annotations
