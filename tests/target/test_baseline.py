@@ -139,8 +139,8 @@ def test_runs_execute_nearly_every_instruction_of_the_control_laws():
             and not file.startswith(("firmware/control/position/", "firmware/control/identify."))]
     # Torque mode, single and partial pulses, slow counts, a periodic load that is learned and forgotten, and sets of
     # parameters with other angles of commutation, do not occur in these runs, nor does what position mode has inlined
-    # of firmware/fixed.
-    assert 0.75 < sum(of.executed for of in laws) / sum(of.instructions for of in laws) <= 1
+    # of firmware/fixed, nor its finer inertia in control/inertia.c.
+    assert 0.7 < sum(of.executed for of in laws) / sum(of.instructions for of in laws) <= 1
     background = [of for file, of in files.items() if file.startswith("firmware/comms/")]
     assert not any(of.in_interrupts for of in background)
     assert sum(of.executed for of in background) > 0
