@@ -25,7 +25,9 @@ from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
 from salient.identify.sequence import Findings, Pulse
 
 ANGLES, CURRENTS = 48, 24
-_ITERATIONS = 5
+_ITERATIONS, _SMOOTHED = 5, 3
+"""Iterations, and the one in which the smoothness is found: angles, delay and offsets are known then, whose errors would
+ask for a smoother map."""
 _ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1), (1e-4, 1e-3, 1e-2, 0.1)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
@@ -147,7 +149,7 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
               np.zeros(0))
     for iteration in range(_ITERATIONS):
         problem = _problem(rows, phases, fit, linear=iteration == 0)
-        if iteration == 1:
+        if iteration == _SMOOTHED:
             fit = replace(fit, smoothness=_smoothness(problem, rows))
             problem = _problem(rows, phases, fit, linear=False)
         fit = _solution(problem, rows, phases)
