@@ -69,8 +69,10 @@ def plate_of(path: Path, folder: Path) -> Path:
     return plate
 
 
-def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: Any) -> tuple[Result, Path, float]:
-    """Result, machine file and virtual time of an identification under a condition."""
+def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: Any, label: str = "") -> tuple[
+        Result, Path, float]:
+    """Result, machine file and virtual time of an identification under a condition. label: part of the file's name; a
+    process reads a machine file once."""
     plate = plate_of(path, folder)
     machine = load_machine(plate)
     data = scaling_of(path, load_machine(path)).data
@@ -94,7 +96,7 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
             time_s = bench.time_s
         finally:
             bench.close()
-    file = folder / f"measured_{path.stem}.toml"
+    file = folder / f"measured_{path.stem}{label and '_'}{'_'.join(label.replace(',', '').split())}.toml"
     write_machine(result, plate, file)
     return result, file, time_s
 
@@ -158,7 +160,7 @@ def main(arguments: Sequence[str]) -> int:
         for condition in options.condition or CONDITIONS:
             entry: dict[str, Any] = {"machine": path.stem, "condition": condition}
             try:
-                result, file, time_s = identified(path, CONDITIONS[condition], options.out, lambda _: None)
+                result, file, time_s = identified(path, CONDITIONS[condition], options.out, lambda _: None, condition)
                 entry |= {"time_s": time_s, **errors(load_machine(file), load_machine(path), result)}
                 if options.drive:
                     for label, of in (("measured", str(file)), ("true", str(path))):
