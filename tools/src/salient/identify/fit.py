@@ -26,8 +26,8 @@ from salient.identify.sequence import Findings, Pulse
 
 ANGLES, CURRENTS = 48, 24
 _ITERATIONS, _SMOOTHED = 5, 3
-"""Iterations, and the one in which the smoothness is found: angles, delay and offsets are known then, whose errors would
-ask for a smoother map."""
+"""Iterations, and the one in which the smoothness is found: angles, delay and offsets are known then, whose errors
+would ask for a smoother map."""
 _ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1), (1e-4, 1e-3, 1e-2, 0.1)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
