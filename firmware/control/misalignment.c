@@ -110,6 +110,16 @@ static inline void add_to_offset(const misalignment_parameters_t *parameters, mi
         fixed_multiply_shift((int32_t)fixed_shift(phase->offset_q40, 12), (int32_t)parameters->probe_angle, 27);
 }
 
+COLD bool misalignment_is_intact(const misalignment_parameters_t *parameters, const misalignment_t *misalignment,
+                                 uint32_t phases) {
+    for (unsigned i = 0; i < phases; i++) {
+        if (fixed_magnitude(misalignment->phase[i].offset) > 8u * parameters->probe_angle) { /* 3.5 of 0.02 rad are 7 */
+            return false;
+        }
+    }
+    return true;
+}
+
 /* Gain of means over the time since the state became steady, at most 100 ms: before, the load was another. */
 static inline int32_t growing_mean_q16(const misalignment_parameters_t *parameters, uint32_t steady_updates,
                                        int32_t phases) {

@@ -161,6 +161,10 @@ int32_t misalignment_slope_q24(const misalignment_t *misalignment);
 void misalignment_step(const misalignment_parameters_t *parameters, misalignment_t *misalignment,
                        const machine_tables_t *tables, const misalignment_sample_t *sample);
 
+/* False when the angle of a phase is beyond what is ever learned: it has changed in memory. */
+bool misalignment_is_intact(const misalignment_parameters_t *parameters, const misalignment_t *misalignment,
+                            uint32_t phases);
+
 /* One sample: updates the offset that the phases have in common, from the slopes of the last misalignment_step of each
  * and the mean of y since the last step, of four of them, while those learn from the ripple; each takes it with its
  * next step. Torque reference in N m, Q7.24; stroke_part_q16: part of a stroke since the last step, from 0; rounding as

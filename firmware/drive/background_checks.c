@@ -237,7 +237,9 @@ COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
     self_test_step(test, hal, &drive->control_parameters, &drive->parameters, time_us);
     hal_critical_enter(hal);
     if (!self_test_latch_intact(&drive->control) || !is_commanded(drive) || !is_arming_intact(drive, time_us) ||
-        !is_lost_phase_intact(drive)) {
+        !is_lost_phase_intact(drive) ||
+        !misalignment_is_intact(&drive->control_parameters.misalignment, &drive->control.deferred.misalignment,
+                                machine_tables.phases)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
         drive->control.torque_reference_q24 = 0;
         control_prepare(&drive->control_parameters, &drive->control);

@@ -723,6 +723,26 @@ TEST_F(Drive, a_bit_of_a_run_s_request_or_arming_that_flips_does_not_end_the_run
     EXPECT_GT(faults, 32u + 32u + 1u + 16u) << "requests, armed, check, and times that are not in order";
 }
 
+TEST_F(Drive, an_angle_beyond_what_is_learned_is_the_fault_memory) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    const int32_t most = int32_t(7 * drive.control_parameters.misalignment.probe_angle);
+    for (const int32_t sign : {-1, 1}) {
+        for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+            const drive_t before = drive;
+            drive.control.deferred.misalignment.phase[phase].offset = sign * most;
+            periods(2);
+            EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE) << phase;
+            drive = before;
+            drive.control.deferred.misalignment.phase[phase].offset = sign * (most / 7 * 8 + 8);
+            periods(2);
+            EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY) << phase;
+            drive = before;
+        }
+    }
+}
+
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);
     command(COMMAND_RUN);
