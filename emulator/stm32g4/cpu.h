@@ -38,10 +38,10 @@ void cpu_reset(void);
 /* Runs until the cycle, BKPT, or, with `to_sleep`, until the processor sleeps with nothing to wake it. */
 void cpu_run(uint64_t end, bool to_sleep);
 
-/* The processor does not execute until the cycle (a stall of the flash). */
 /* A word of bank 1 has a double error from now on. */
 void cpu_tear(uint32_t address);
 
+/* The processor does not execute until the cycle (a stall of the flash). */
 void cpu_stall(uint64_t to);
 
 uint32_t cpu_program_counter(void);

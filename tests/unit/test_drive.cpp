@@ -581,6 +581,12 @@ TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_ne
     EXPECT_EQ(drive.command.request, COMMAND_OFF) << "withdrawn";
 }
 
+// A bit of a member that begins at a byte of the drive.
+void flip(drive_t &drive, size_t at, size_t bit) {
+    uint8_t *bytes = reinterpret_cast<uint8_t *>(&drive) + at;
+    bytes[bit / 8] = uint8_t(bytes[bit / 8] ^ 1u << bit % 8);
+}
+
 // Members by which the drive finds others; without a limit where they are used a bit of them crashes this program.
 #define INDEX(member)                                                                                                  \
     { #member, offsetof(drive_t, member), sizeof(drive_t{}.member) }
@@ -634,8 +640,7 @@ TEST_F(Drive, a_flipped_bit_of_an_index_leads_nowhere_outside_of_its_array) {
         const hal_t board = hal;
         for (const auto &index : INDICES) {
             for (size_t bit = 0; bit < 8 * index.bytes; bit++) {
-                uint8_t *bytes = reinterpret_cast<uint8_t *>(&drive) + index.at;
-                bytes[bit / 8] = uint8_t(bytes[bit / 8] ^ 1u << bit % 8);
+                flip(drive, index.at, bit);
                 periods(40);
                 EXPECT_LT(unsigned(drive.control.state_machine.state), DRIVE_STATE_COUNT) << index.name << ' ' << bit;
                 drive = before;
@@ -709,8 +714,7 @@ TEST_F(Drive, a_bit_of_a_run_s_request_or_arming_that_flips_does_not_end_the_run
     unsigned faults = 0;
     for (const auto &member : members) {
         for (size_t bit = 0; bit < 8 * member.bytes; bit++) {
-            uint8_t *bytes = reinterpret_cast<uint8_t *>(&drive) + member.at;
-            bytes[bit / 8] = uint8_t(bytes[bit / 8] ^ 1u << bit % 8);
+            flip(drive, member.at, bit);
             periods(40);
             const bool runs = drive.control.state_machine.state == DRIVE_STATE_RUN;
             EXPECT_NE(runs, drive.control.state_machine.record.fault == FAULT_MEMORY) << member.name << ' ' << bit;

@@ -1,6 +1,6 @@
 """The program that checks the port on the model of the part (tests/target/stm32g4/port): its build, and its verdict.
 
-The port's own sources, start and linker scripts, linked with a program in the place of the drive. It checks itself; the
+The port's own sources, start and linker scripts, linked with a program instead of the drive. It checks itself; the
 edges of the gates, which the model writes to a file, are compared with the definition in hal/hal_pwm.h here.
 """
 
@@ -82,7 +82,7 @@ def gates() -> list[str]:
 
 
 def verdict(image: Path, clock_mhz: int, model: Path = MODEL) -> str:
-    """The first complaint, "" when there is none."""
+    """The first complaint; empty without one."""
     trace = image.with_suffix(".edges")
     try:
         done = subprocess.run([str(model), str(image), "--alone", "--limit-us", str(_LIMIT_US), "--trace", str(trace),
@@ -120,7 +120,7 @@ def expected_edges(switch: int, period: int) -> list[int]:
 
 
 def wrong_edges(trace: str, clock_mhz: int) -> str:
-    """Compares the edges of the sweep, which come first, with the contract: what is wrong, "" when nothing is."""
+    """Compares the edges of the sweep, which come first, with the contract: the first difference; empty without one."""
     period = clock_mhz * 1_000_000 // 40_000 // 2
     edges: dict[str, list[tuple[int, int]]] = {pin: [] for pin in gates()}
     for line in trace.splitlines():

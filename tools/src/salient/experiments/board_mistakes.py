@@ -133,7 +133,7 @@ def _right_image() -> Path:
 
 
 def look(bug: Bug) -> str:
-    """The first complaint about a mistake, "" when there is none."""
+    """The first complaint about a mistake; empty without one."""
     with tempfile.TemporaryDirectory(prefix="salient-") as name:
         folder = Path(name)
         if of_port(bug):
