@@ -12,7 +12,9 @@ from typing import Any
 import can
 import pytest
 
+from salient.bench.a2l import is_short
 from salient.bench.drive import command_frame
+from salient.bench.variables import SIGNALS, Variables, short_names
 from salient.bus.clock import open_bus
 from salient.bus.signals import rig_database
 from salient.machine.path import machine_path
@@ -52,9 +54,9 @@ def command(name: str, **args: Any) -> dict[str, Any]:
     return {"name": name, "args": args}
 
 
-def test_one_file_of_at_most_330_kB_packed_that_refers_to_nothing_outside(tab):
+def test_one_file_of_at_most_345_kB_packed_that_refers_to_nothing_outside(tab):
     text = tab.read_text(encoding="utf-8")
-    assert 150_000 < tab_file.packed_bytes(text.encode()) <= 330_000
+    assert 150_000 < tab_file.packed_bytes(text.encode()) <= 345_000
     assert not re.search(r'\b(src|href)="(?!data:)', text)
     assert not re.search(r"\b(fetch|WebSocket|XMLHttpRequest|importScripts)\(", text)
 
@@ -232,3 +234,94 @@ def test_another_client_on_the_bus_leaves_no_link(make_bench):
         other.send(command_frame(0, "off", 0.0))
         bench.run_for(0.01)
     assert link_of(bench) is None
+
+
+SCOPE = ["torque_reference_Nm", "speed_rpm", "state", "control.measurement.current_q9[1]"]
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("machine", ["saturating", "finite_element"])
+def test_triggered_buffer_read_in_the_tab_has_the_records_of_the_tools(tab, make_bench, machine):
+    bench = make_bench(machine=machine)
+    bench.run_for(0.12)
+    bench.drive.speed_reference_rpm = 300
+    bench.run_for(0.2)
+    scope = bench.scope(SCOPE, trigger="torque_reference_Nm rises to 3", before=0.4)
+    bench.advance_to(450 * MS)
+    bench.load_torque_Nm = 4
+    bench.advance_to(650 * MS)
+    expected = scope.read()
+    made, = run_in_tab(tab, {"machine": machine, "steps": [
+        to(120), command("speed_reference", rpm=300), to(320), command("scope_read"),
+        command("scope_arm", signals=SCOPE, trigger="torque_reference_Nm rises to 3", before=0.4),
+        command("scope_read"), to(450), command("load_torque", Nm=4), to(650), command("scope_read")]})
+    _, early, armed, waits, _, read = made["answers"]
+    assert early["message"] == "the buffer is not armed"
+    assert armed["ok"], armed["message"]
+    assert waits["value"] == {"state": "waits"}
+    assert made["time_ns"] == 650 * MS  # reading takes no time of the run
+    recording = read["value"]
+    assert recording["title"] == "torque_reference_Nm rises to 3"
+    assert len(recording["time_s"]) == len(expected.time_s) > 1000
+    assert recording["time_s"] == pytest.approx(expected.time_s.tolist(), abs=1e-9)
+    for signal in recording["signals"]:
+        assert signal["values"] == pytest.approx(expected[signal["name"]].tolist(), rel=1e-12)
+    assert [signal["unit"] for signal in recording["signals"]] == [expected.units[name] for name in SCOPE]
+    assert "run" in recording["signals"][2]["choices"].values()
+
+
+def test_triggered_buffer_of_a_link_is_armed_again_and_triggered_by_hand(tab):
+    made, = run_in_tab(tab, {"steps": [
+        to(150), command("scope_arm", signals=SCOPE[:2], trigger="state == fault"), to(300), command("scope_trigger"),
+        to(500), command("scope_read")]})
+    assert [answer["message"] for answer in made["answers"] if not answer["ok"]] == []
+    again, = run_in_tab(tab, {"link": made["link"], "steps": [to(500), command("scope_read")]})
+    assert again["same"] == [[500 * MS, True]]
+    assert again["answers"][0]["value"] == made["answers"][-1]["value"]
+    assert made["answers"][-1]["value"]["state"] == "complete"
+
+
+def test_scope_names_the_wrong_signal_trigger_or_divider_and_arms_nothing(tab):
+    wrong = [{"signals": ["curent_a_A"]}, {"signals": []}, {"signals": ["speed_rpm"] * 9},
+             *({"signals": ["speed_rpm"], "trigger": trigger} for trigger in (
+                 "speed_rpm is 5", "speed_rpm > x", "state == broken", "state > 9e9")),
+             {"signals": ["speed_rpm"], "divider": 0}, {"signals": ["speed_rpm"], "before": 1}]
+    arming = [command("scope_arm", **each) for each in wrong]
+    made, = run_in_tab(tab, {"steps": [to(150), *arming, command("scope_read")]})
+    messages = [answer["message"] for answer in made["answers"]]
+    assert messages[0] == ("signal 'curent_a_A': no variable of the drive; the nearest are current_a_A, "
+                           "current_b_A, current_c_A")
+    assert messages[1] == messages[2] == "signals: must be 1 to 8 names"
+    assert "must be 'SIGNAL > VALUE'" in messages[3] and "x must be a number" in messages[4]
+    assert "broken must be a number or one of" in messages[5] and "state is from 0 to " in messages[6]
+    assert messages[7:] == ["divider 0: must be a whole number from 1 to 65535",
+                            "before 1: must be from 0 to below 1, the part before the trigger",
+                            "the buffer is not armed"]
+
+
+@pytest.mark.parametrize("machine", ["saturating", "linear_cosine"])
+def test_variables_of_the_tab_are_those_of_the_tools_in_the_memory_of_its_module(tab, machine):
+    made, = run_in_tab(tab, {"machine": machine, "variables": True, "steps": []})
+    variables = Variables("wasm", machine)
+    short = [each for each in variables.quantities() if is_short(each.variable.path)]
+    named = [variables.quantity(name) for name, path in SIGNALS.items() if path in variables.paths and path != name]
+    assert len(short) > 1000 and len(named) > 10
+    assert made["variables"] == [
+        {"name": each.name, "address": each.variable.address, "bytes": each.variable.bytes,
+         "signed": each.variable.is_signed, "unit": each.unit, "factor": each.factor,
+         "choices": {str(value): name for value, name in short_names(each.variable.names).items()} or None}
+        for each in [*short, *named]]
+
+
+@pytest.mark.in_turns
+def test_scope_of_the_tools_reads_the_module_as_it_reads_the_host(make_bench):
+    """The drive compares the layout, so that the module has the one of which the names are."""
+    recordings = []
+    for build in ("host", "wasm"):
+        bench = make_bench(build=build)
+        bench.drive.speed_reference_rpm = 300
+        bench.run_for(0.2)
+        recordings.append(bench.scope(SCOPE, trigger="speed_rpm >= 250").read())
+    host, module = recordings
+    assert module.time_s.tolist() == host.time_s.tolist()
+    assert all(module[name].tolist() == host[name].tolist() for name in SCOPE)

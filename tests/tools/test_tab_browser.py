@@ -99,6 +99,26 @@ def test_commands_act_on_the_drive_and_refusals_are_said(tab, open_page):
     page.wait_for_function("document.querySelectorAll('#fault-log tbody tr').length === 1")
 
 
+def test_scope_reads_the_buffer_of_the_drive_in_the_tab(tab, open_page):
+    page = open_page(tab)
+    wait_until(page, 0.3)
+    page.get_by_role("tab", name="Scope").click()
+    page.fill("#scope-signals", "torque_reference_Nm, state control.duty_q15[0]")
+    page.fill("#scope-trigger", "torque_reference_Nm > x")
+    page.click("#scope-form button")
+    page.wait_for_function("!document.getElementById('notice').hidden")
+    assert "must be a number" in notice(page)
+    page.fill("#scope-trigger", "torque_reference_Nm rises to 3")
+    page.click("#scope-form button")
+    page.wait_for_function("document.getElementById('scope-state').textContent.startsWith('Waits')")
+    assert "torque_reference_Nm" in page.locator("#scope-names").inner_text()
+    page.evaluate("salient.act('load_torque', { Nm: 5 })")
+    page.wait_for_function("document.getElementById('recording').open")
+    assert page.locator("#recording-title").inner_text().endswith("torque_reference_Nm rises to 3")
+    assert page.locator("#recording-plots canvas").count() == 3
+    page.screenshot(path=PICTURES / "tab_scope.png")
+
+
 def test_rewound_and_replayed_the_run_has_the_same_bits_and_another_branch_is_beside_it(tab, open_page):
     page = open_page(f"{tab}#{BITS}&until=0.35")
     page.wait_for_function("salient.stopped")

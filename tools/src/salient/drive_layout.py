@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from inspect import signature
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +19,9 @@ if TYPE_CHECKING:
 _ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
 _VARIABLE = b"drive_layout"
 _BYTES_MAX = 4
+_WASM = b"\0asm\1\0\0\0"
+"""Begin of a WebAssembly module."""
+_CUSTOM_SECTION = 0
 _SIGNED = {5, 6}
 """DW_ATE_signed and DW_ATE_signed_char."""
 
@@ -47,12 +53,14 @@ class Layout:
         from elftools.elf.elffile import ELFFile  # the pytest plugin loads this module where it is not installed
 
         with program.open("rb") as file:
-            elf = ELFFile(file)
-            found = _find(elf.get_dwarf_info()) if elf.has_dwarf_info() else None
+            is_wasm = file.read(len(_WASM)) == _WASM
+            elf = None if is_wasm else ELFFile(file)
+            dwarf = _wasm_dwarf(file.read()) if elf is None else _elf_dwarf(elf)
+            found = None if dwarf is None else _find(dwarf)
             if found is None:
                 raise UsageError(f"{program}: no debug information of the drive")
             self._type = _described(_target(_target(found)))
-            self.hash = _word_at(elf, "drive_layout_hash")
+            self.hash = _hash_beside(program) if elf is None else _word_at(elf, "drive_layout_hash")
         self.size: int = self._type["bytes"]
 
     def variables(self) -> Iterator[Variable]:
@@ -78,6 +86,50 @@ class Layout:
             begin, length, _, of = found[0]
             first += begin
         return range(first, first + length)
+
+
+def _elf_dwarf(elf: ELFFile) -> Any:
+    return elf.get_dwarf_info() if elf.has_dwarf_info() else None
+
+
+def _wasm_dwarf(sections: bytes) -> Any:
+    """Debug information of a WebAssembly module, which has it in sections with the names that ELF gives them.
+    pyelftools opens ELF files only, and reads the sections of any."""
+    from elftools.dwarf.dwarfinfo import DebugSectionDescriptor, DwarfConfig, DWARFInfo
+
+    found = {}
+    at = 0
+    while at < len(sections):
+        kind = sections[at]
+        size, begin = _leb128(sections, at + 1)
+        at = begin + size
+        if kind == _CUSTOM_SECTION:
+            length, begin = _leb128(sections, begin)
+            name, content = sections[begin:begin + length].decode(), sections[begin + length:at]
+            found[name.lstrip(".") + "_sec"] = DebugSectionDescriptor(BytesIO(content), name, 0, len(content), 0)
+    names = [name for name in signature(DWARFInfo).parameters if name != "config"]
+    if "debug_info_sec" not in found:
+        return None
+    return DWARFInfo(DwarfConfig(little_endian=True, machine_arch="", default_address_size=4),
+                     **{name: found.get(name) for name in names})
+
+
+def _leb128(data: bytes, at: int) -> tuple[int, int]:
+    """An unsigned number in groups of seven bits, and where it ends."""
+    value = shift = 0
+    while True:
+        value |= (data[at] & 0x7F) << shift
+        shift += 7
+        at += 1
+        if data[at - 1] < 0x80:  # the last group
+            return value, at
+
+
+def _hash_beside(program: Path) -> int:
+    """The hash with which a WebAssembly module was built: its symbols have no addresses in the file."""
+    header = program.parent / "layout" / "layout_hash.h"
+    found = re.search(r"LAYOUT_HASH 0x(\w+?)u", header.read_text(encoding="utf-8"))
+    return int(found[1], 16) if found else 0
 
 
 def _word_at(elf: ELFFile, symbol: str) -> int:
@@ -127,7 +179,9 @@ def _described(entry: Any) -> dict[str, Any]:
     if entry.tag == "DW_TAG_array_type":
         of = _described(_target(entry))
         for dimension in reversed([each for each in entry.iter_children() if each.tag == "DW_TAG_subrange_type"]):
-            length = _number(dimension, "DW_AT_upper_bound") + 1
+            count = "DW_AT_count"  # as Clang has it
+            length = (_number(dimension, count) if count in dimension.attributes
+                      else _number(dimension, "DW_AT_upper_bound") + 1)
             of = {"bytes": length * of["bytes"], "elements": (length, of)}
         return of
     if entry.tag not in ("DW_TAG_structure_type", "DW_TAG_union_type"):

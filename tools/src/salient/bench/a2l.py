@@ -37,7 +37,7 @@ def a2l_of(machine: str, build: str = "host", node: int = 0) -> str:
     scaling = scaling_of(path, load_machine(path))
     variables = Variables(build, machine)
     quantities = [*(variables.quantity(name) for name in SIGNALS if name not in variables.paths),
-                  *(each for each in variables.quantities() if _is_short(each.variable.path))]
+                  *(each for each in variables.quantities() if is_short(each.variable.path))]
     methods = _Methods()
     rows = list(zip(read_table(), scaling.fraction_bits(), strict=True))
     body = "\n".join([*(_measurement(each, methods) for each in quantities),
@@ -61,7 +61,8 @@ def write_a2l(file: Path, machine: str, node: int = 0) -> None:
         raise UsageError(f"--a2l {file}: {error.strerror}") from None
 
 
-def _is_short(path: str) -> bool:
+def is_short(path: str) -> bool:
+    """False for members of arrays that are no signals."""
     return all(int(index) < ELEMENTS_MAX for index in re.findall(r"\[(\d+)\]", path))
 
 

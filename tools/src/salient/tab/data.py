@@ -10,6 +10,7 @@ from salient.bus.signals import drive_database
 from salient.dbc import attributes
 from salient.machine.path import machine_path
 from salient.paths import MACHINES
+from salient.tab.variables import factors_of, variables_data
 from salient.view.description import description
 
 _MACHINE_DEPENDENT = ("factor", "offset", "minimum", "maximum")
@@ -23,13 +24,14 @@ def bundled_machines() -> list[str]:
 
 
 def shared_data() -> dict[str, Any]:
-    """Faults, named values of parameters and data IDs, which no machine changes."""
+    """Faults, named values of parameters, data IDs and variables, which no machine changes."""
     any_machine = description(bundled_machines()[0], 0)
     return {
         "faults": any_machine["faults"],
         "parameter_choices": any_machine["parameter_choices"],
         "data_ids": {message.name: e2e.data_id(message) for message in drive_database().messages
                      if "E2EDataId" in attributes(message)},
+        "variables": variables_data(),
     }
 
 
@@ -41,7 +43,7 @@ def machine_data(machines: list[str]) -> dict[str, Any]:
         "machines": {
             machine_path(name).stem: {
                 "machine": _rounded(each["machine"]), "database_hash": each["database_hash"],
-                "signals": _different(first["databases"], each["databases"]),
+                "signals": _different(first["databases"], each["databases"]), "factors": factors_of(name),
             } for name, each in zip(machines, found, strict=True)
         },
     }

@@ -46,6 +46,7 @@ export class Client {
         this.state = {
             request: null, torqueMode: false, speed_rpm: 0, torque_Nm: 0, counter: 0, commandDueNs: NEVER,
             arming: null, armingCounter: 0, disarmedNs: null, setCounter: 0, faults: [], latest: new Map(),
+            buffer: null, // what it is armed for
         };
         this.rows = null; // parameters, the same in every state
     }

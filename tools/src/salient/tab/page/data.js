@@ -1,6 +1,6 @@
 // The packed block of salient.tab.file: module, machines, databases.
 
-/** { build, version, faults, parameter_choices, data_ids, databases, machines, module, images by machine } */
+/** { build, version, faults, parameter_choices, data_ids, variables, databases, machines, module, images by machine } */
 export async function readData(text) {
     const packed = Uint8Array.from(atob(text), (each) => each.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));

@@ -3,6 +3,7 @@
 
 import { Client, Rejected } from "./client.js";
 import { World } from "./world.js";
+import { armBuffer, readBuffer, triggerBuffer } from "./xcp.js";
 
 const SNAPSHOT_STEP_NS = 250e6;
 /** How far back one can go. */
@@ -23,12 +24,16 @@ const ACTIONS = {
     end_faults: (client) => client.endFaults(),
     set_parameters: (client, { values }, { choices }) => client.setParameters(choices, values),
     save_parameters: (client) => client.saveParameters(),
+    scope_arm: (client, args, { variables }) => armBuffer(client, variables, args),
+    scope_trigger: (client) => triggerBuffer(client),
     frame: (client, { id, data }) => client.frame(id, data),
 };
 const QUERIES = {
     parameters: (client) => client.parameters(),
     fault_trace: (client) => client.faultTrace(),
     fault_log: (client) => client.faultLog(),
+    scope_names: (client, { variables }) => variables.short,
+    scope_read: (client, { variables }) => readBuffer(client, variables),
 };
 
 /** Commands of which a link can consist, and all that a run carries out. */
@@ -36,11 +41,11 @@ export const EVENTS = Object.keys(ACTIONS).filter((name) => name !== "frame");
 export const RUN_COMMANDS = [...EVENTS, ...Object.keys(QUERIES)];
 
 export class Run {
-    /** faults, choices: of an Info. onFrame: as of the client, for frames that are new. onSame(timeNs, same): a hash that
-     *  was known for this time has been compared. */
-    constructor({ messages, faults, choices, onFrame = () => {}, onSame = () => {} }) {
+    /** faults, choices: of an Info; variables: Variables. onFrame: as of the client, for frames that are new.
+     *  onSame(timeNs, same): a hash that was known for this time has been compared. */
+    constructor({ messages, faults, choices, variables, onFrame = () => {}, onSame = () => {} }) {
         this.silent = false;
-        this.known = { faults, choices };
+        this.known = { faults, choices, variables };
         this.onSame = onSame;
         this.client = new Client(messages, (...frame) => this.silent || onFrame(...frame));
         this.world = new World((records) => this.client.receive(records));
@@ -81,7 +86,7 @@ export class Run {
     command(name, args) {
         try {
             if (name in QUERIES) {
-                return { ok: true, message: "", value: this.#aside(() => QUERIES[name](this.client)) };
+                return { ok: true, message: "", value: this.#aside(() => QUERIES[name](this.client, this.known)) };
             }
             this.#prepare(name);
             this.ahead = [];

@@ -4,6 +4,7 @@ import { databasesOf } from "./data.js";
 import { Messages } from "./messages.js";
 import { RUN_COMMANDS, Run } from "./run.js";
 import { writeLink } from "./link.js";
+import { Variables } from "./variables.js";
 
 const SLICE_NS = 1e6;
 const BUDGET_MS = 12; // of computation for one display frame: time goes slower where the computer is slow
@@ -69,7 +70,7 @@ export class TabSource {
         const { machine, database_hash: hash } = data.machines[setting.machine];
         this.run = new Run({
             messages: new Messages(databasesOf(data, setting.machine), data.data_ids), faults: data.faults,
-            choices: data.parameter_choices,
+            choices: data.parameter_choices, variables: new Variables(data.variables, data.machines[setting.machine].factors),
             onFrame: (...frame) => this.columns.add(...frame),
             onSame: (timeNs, same) => this.takeSame(timeNs, same),
         });
