@@ -387,6 +387,13 @@ static uint32_t fdcan_read(uint32_t address) {
     }
 }
 
+/* States of FIFOs and buffers, by a reset and by the start of CCE. */
+static void empty(void) {
+    can.requested = 0;
+    can.leaving = false;
+    can.get[0] = can.get[1] = can.level[0] = can.level[1] = 0;
+}
+
 static void mode_write(uint32_t value) {
     const uint32_t old = REG(CCCR);
     if (value & ~(CCCR_INIT | CCCR_CCE | CCCR_MON | CCCR_TEST | CCCR_CSR | 0x1040u)) {
@@ -400,10 +407,8 @@ static void mode_write(uint32_t value) {
         soc_violation("write of FDCAN1_CCCR, value 0x%X: CCE is set with INIT = 1 alone", value);
     }
     REG(CCCR) = value & CCCR_INIT ? value : value & ~CCCR_CCE;
-    if (value & CCCR_CCE && !(old & CCCR_CCE)) { /* resets the states of FIFOs and buffers */
-        can.requested = 0;
-        can.leaving = false;
-        can.get[0] = can.get[1] = can.level[0] = can.level[1] = 0;
+    if (value & CCCR_CCE && !(old & CCCR_CCE)) {
+        empty();
         REG(TXBRP) = REG(TXBTO) = REG(TXBCF) = 0;
     }
     if (old & CCCR_INIT && !(value & CCCR_INIT)) {
@@ -479,9 +484,8 @@ void fdcan_attach(void) {
 
 void fdcan_reset(void) {
     memset(can.sent, 0, sizeof can.sent);
-    can.leaving = can.off = can.was_off = can.was_warned = can.was_passive = false;
+    can.off = can.was_off = can.was_warned = can.was_passive = false;
     can.tec = can.rec = 0;
-    can.requested = 0;
-    can.get[0] = can.get[1] = can.level[0] = can.level[1] = 0;
+    empty();
     lines();
 }

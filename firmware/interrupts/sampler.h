@@ -12,10 +12,10 @@
  * - A word of the drive is kept as a part of the drive, in 2^-32: the high half of the product with the number of words
  *   is its place, and whatever the part has become in memory, the place is within the drive.
  * - Every condition is one window. The variable is shifted by a multiplication to the upper end of a word, and its
- * range may go beyond the largest word to the smallest. Bits of lower variables of its word count to the variable's
- * step. A change is every value but the one at the arming. An edge waits until the variable is outside.
+ *   range may go beyond the largest word to the smallest. Bits of lower variables of its word count to the variable's
+ *   step. A change is every value but the one at the arming. An edge waits until the variable is outside.
  * - A record begins before SAMPLER_WORDS, and the ring is longer by the rest of one. The one test that begins at 0
- * again bounds a place that has changed in memory, too.
+ *   again bounds a place that has changed in memory, too.
  */
 #ifndef INTERRUPTS_SAMPLER_H
 #define INTERRUPTS_SAMPLER_H
