@@ -360,6 +360,8 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
         parameters->predictive.flux = tuned->predictive.flux;
         parameters->conduction = tuned->conduction;
         parameters->misalignment = tuned->misalignment;
+        return;
+    case CONFIGURE_TUNE_POSITION:
         parameters->position = tuned->position;
         return;
     default: { /* of the observer */

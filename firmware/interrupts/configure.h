@@ -27,10 +27,11 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                        uint32_t timer_clock_hz);
 
 /* Parts in which a run takes over tuned parameters, so that no interrupt waits for all of them: laws of speed and load,
- * laws of torque, then each stage of the observer's bandwidth. */
+ * laws of torque, laws of position, then each stage of the observer's bandwidth. */
 enum {
     CONFIGURE_TUNE_SPEED,
     CONFIGURE_TUNE_TORQUE,
+    CONFIGURE_TUNE_POSITION,
     CONFIGURE_TUNE_FIRST_STAGE,
     CONFIGURE_TUNE_PARTS = CONFIGURE_TUNE_FIRST_STAGE + OBSERVER_BANDWIDTH_STAGES
 };
