@@ -134,7 +134,8 @@ def print_status(line: str) -> None:
 
 def install_packages(dependencies: tuple[Dependency, ...], install: bool) -> None:
     """Installs missing Debian packages, or names them and ends."""
-    missing = [dependency for dependency in dependencies if not dependency.present()]
+    by_package = {dependency.package: dependency for dependency in dependencies}
+    missing = [dependency for dependency in by_package.values() if not dependency.present()]
     if not missing:
         return
     packages = [dependency.package for dependency in missing]

@@ -19,6 +19,7 @@ from salient.bench.recording import COLOURS, FORMATS, label_axes, write_columns
 from salient.bench.session import SILENCE_MAX_S, Session
 from salient.bench.variables import SIGNALS as SHORT_NAMES
 from salient.bench.variables import Variables
+from salient.bench.xcp import load_client
 from salient.bus.databases import load_databases, messages_of
 from salient.bus.frame_bits import BitRates
 from salient.bus.log import open_log
@@ -75,6 +76,7 @@ def _record(options: argparse.Namespace) -> int:
     table = options.out if is_file else options.out / TABLE
     pictures = [] if is_file else [options.out / PLOT]
     make_folder(table.parent, [path.name for path in (table, *pictures)])
+    load_client()
     with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
                  silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
         scope = sampler.arm(session, options.signals, options.trigger, before=options.before, divider=options.divider)

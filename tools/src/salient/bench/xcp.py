@@ -108,16 +108,26 @@ def key_of(resource: int, seed: bytes) -> bytes:
     return bytes(255 - byte for byte in seed)
 
 
-@contextmanager
-def connected(session: LoggingClient) -> Iterator[Master]:
-    """A connected pyXCP master with both resources unlocked. XcpError: see SessionInterface; RunFailed without pyXCP.
-    """
+def load_client() -> None:
+    """Imports pyXCP, which takes a second: before a session with a drive whose time goes on meanwhile, since the bus
+    drops what is not read. RunFailed: it is not installed."""
     try:
-        from pyxcp.config import create_application_from_config
-        from pyxcp.master.master import Master
-        from pyxcp.types import XcpResponseError, XcpTimeoutError
+        import pyxcp.config
+        import pyxcp.master.master
+        import pyxcp.types  # noqa: F401
     except ImportError:
         raise RunFailed(_INSTALL) from None
+
+
+@contextmanager
+def connected(session: LoggingClient) -> Iterator[Master]:
+    """A connected pyXCP master with both resources unlocked. XcpError: see SessionInterface; RunFailed: see
+    load_client."""
+    load_client()
+    from pyxcp.config import create_application_from_config
+    from pyxcp.master.master import Master
+    from pyxcp.types import XcpResponseError, XcpTimeoutError
+
     interface = SessionInterface(session)
     command_id, response_id = interface.identifiers
     application = create_application_from_config(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from salient.bench.session import SILENCE_MAX_S, Session
 from salient.bench.settings import parse_values
+from salient.bench.xcp import load_client
 from salient.errors import UsageError
 from salient.identify.link import linked
 from salient.identify.report import write_report
@@ -67,6 +68,7 @@ def _session(options: argparse.Namespace) -> Iterator[Session]:
         for name in ("set", "encoder_bits", "seed"):
             if getattr(options, name):
                 raise UsageError(f"--{name.replace('_', '-')}: only with --true-machine")
+        load_client()
         with Session(options.can, lockstep=False, machine=options.machine, node=options.node,
                      silence_max_s=SILENCE_MAX_S, machine_option="--machine") as session:
             yield session
