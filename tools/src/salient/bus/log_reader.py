@@ -168,7 +168,8 @@ def _check(time_ns: int, message: can.Message, count: int) -> None:
 
 
 def _read_database(path: Path) -> Frames:
-    """The frames of an SQLite file that python-can has written; it has no flexible data rate, and times as floats."""
+    """The frames of an SQLite file that python-can has written; it does not say that a frame has a flexible data rate,
+    and has times as floats."""
     connection = sqlite3.connect(f"file:{path.resolve().as_posix().replace('?', '%3f').replace('#', '%23')}?mode=ro",
                                  uri=True)
     count = 0
@@ -178,7 +179,8 @@ def _read_database(path: Path) -> Frames:
             count += 1
             yield nanoseconds(repr(float(time_s))), can.Message(
                 arbitration_id=int(identifier), is_extended_id=bool(extended), is_remote_frame=bool(remote),
-                is_error_frame=bool(error), dlc=int(dlc), data=b"" if remote else bytes(data or b""))
+                is_error_frame=bool(error), is_fd=len(data or b"") > 8, dlc=int(dlc),
+                data=b"" if remote else bytes(data or b""))
     except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
         raise Damage(f"after row {count}: {error}") from None
     finally:
