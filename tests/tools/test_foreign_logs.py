@@ -20,6 +20,7 @@ from salient.config import Rotation
 from salient.errors import RunFailed, UsageError
 
 FRAME_DATA = bytes(range(8))
+PRINTED = (b"", b"\1\2", b"AB", FRAME_DATA)
 ASC_HEADER = "date Mon Feb 3 08:15:00.000 am 2025\nbase {}  timestamps {}\ninternal events logged\n"
 FD = "CANFD  1 Rx 181   1 0 8 08 01 02 03 04 05 06 07 08 0 0 {} 0 0 0 0 0"
 
@@ -68,7 +69,7 @@ S = 1_000_000_000
         ("a.trc", ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n 1) 1.5 Rx 0123 2 01 02\n",
          [(43_200 * S + 1_500_000, 0x123, b"\1\2")]),
         ("a.trc", ";$FILEVERSION=1.2\n;$STARTTIME=25569\n 1) 1.5 1 Rx 00000123 1 01\n", [(1_500_000, 0x123, b"\1")]),
-        ("a.trc", ";$FILEVERSION=1.3\n;$STARTTIME=25569\n 1) 1.5 1 Rx 0123 - 1 01\n 2) 2.0 1 Event  a remark of a user\n"
+        ("a.trc", ";$FILEVERSION=1.3\n;$STARTTIME=25569\n 1) 1.5 1 Rx 0123 - 1 01\n 2) 2.0 1 Event  a user's remark\n"
          " 3) 2.5 1 Rx 0123 - 1 02\n", [(1_500_000, 0x123, b"\1"), (2_500_000, 0x123, b"\2")]),
         ("a.trc", ";$FILEVERSION=2.0\n;$STARTTIME=25569,5\n;$COLUMNS=N,O,T,I,d,l,D\n 1 1,5 DT 0123 Rx 1 01\n"
          " 2 2 EV a remark of a user\n 3 2,5 DT 0123 Rx 1 02\n",
@@ -81,9 +82,9 @@ S = 1_000_000_000
          "1600000000.223450;2;18FEF100;1;9;12;1;1;1;0102030405060708090A0B0C\n",
          [(1_600_000_000_123_450_000, 0x14A, bytes(range(1, 9))),
           (1_600_000_000_223_450_000, 0x18FEF100, bytes(range(1, 13)))]),
-        ("a.txt", "".join(f"{can.Message(timestamp=number, arbitration_id=0x123, is_extended_id=number > 1, data=data)}\n"
-                          for number, data in enumerate((b"", b"\1\2", b"AB", bytes(range(8))))),
-         [(number * S, 0x123, data) for number, data in enumerate((b"", b"\1\2", b"AB", bytes(range(8))))]),
+        ("a.txt", "".join(f"{can.Message(timestamp=number, arbitration_id=0x123, is_extended_id=number > 1, data=of)}\n"
+                          for number, of in enumerate(PRINTED)),
+         [(number * S, 0x123, data) for number, data in enumerate(PRINTED)]),
         ("a.csv", "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.5,0x12,1,0,0,1,Kg==\n",
          [(3 * S // 2, 0x12, b"*")]),
         ("a.log", "***BUSMASTER Ver 3***\n***HEX***\n23:59:59:0000 Rx 1 0x12 s 1 2A\n00:00:01:0000 Rx 1 0x12 s 1 2B\n",
@@ -106,7 +107,8 @@ def test_text_of_other_tools_is_read_with_all_frames(tmp_path, name, text, frame
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " 0.5 1 11 Rx d 1 05\n 0.6 1 Engine Rx d 0\n", 1, "line 5"),
         ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n1,1,false,Rx,0,1,05\n2,1,false,Rx,0,80000000,05\n",
          1, "line 3"),
-        ("a.txt", f"{can.Message(data=b'1')}\n{can.Message(data=b'12')}"[:-30], 1, "truncated: line 2: it has 1 data bytes and states 2"),
+        ("a.txt", f"{can.Message(data=b'1')}\n{can.Message(data=b'12')}"[:-30], 1,
+         "truncated: line 2: it has 1 data bytes and states 2"),
         ("a.csv", "TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes\n"
          "1;1;1;0;1;1;0;0;0;01\n2;1;1;0;2;2;0;0;0;01\n", 1, "line 3"),
         ("a.trc", ";$FILEVERSION=1.1\n 1) 1.5 Rx 0123 1 01\n 2) 1.6 Rx 0123 2 01\n", 1, "line 3"),

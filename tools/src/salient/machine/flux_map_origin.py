@@ -78,7 +78,7 @@ def _by_end(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
         close_rad = min(error_rad, _SIGHT_RAD) * np.linspace(-1.0, 1.0, 15)
         found = [each for each in _ends(angle_rad, scaled, aligned_rad, _POWERS, near_rad + close_rad)
                  if abs(each[0] - near_rad) < close_rad[-1]] or first
-        # What a polynomial misses lies on one side: the worse ones would pull.
+        # Errors of polynomials lie on one side: the worse ones would pull.
         least_rad = min(error for _, error in found)
         best = [each for each in found if each[1] <= _BEST * least_rad]
         near_rad, error_rad = _mean(best)[0], _mean(found)[1]

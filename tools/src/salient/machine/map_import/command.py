@@ -17,7 +17,6 @@ from salient.machine.map_import.mat import is_mat, is_octave, mat_points, octave
 from salient.machine.map_import.text import blocks, decode
 from salient.toml_file import TextFileError, read_bytes, read_text, read_toml, validate
 
-
 _BINARY = {b"PK\x03\x04": ("a spreadsheet or another ZIP file", "save the table as CSV"),
            b"\xd0\xcf\x11\xe0": ("a spreadsheet of an old Excel", "save the table as CSV"),
            b"\x93NUMPY": ("an array of NumPy", "write it with numpy.savetxt"),

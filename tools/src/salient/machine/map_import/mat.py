@@ -109,9 +109,11 @@ def _vector(array: np.ndarray) -> np.ndarray:
     """A mesh grid, which repeats one row or column, as that; another array as it is."""
     if array.ndim != 2 or 1 in array.shape:
         return array
-    if np.all(array == array[:1]):
-        return array[0]
-    return array[:, 0] if np.all(array == array[:, :1]) else array
+    row: np.ndarray = array[0]
+    column_of: np.ndarray = array[:, 0]
+    if np.all(array == row):
+        return row
+    return column_of if np.all(array == column_of[:, None]) else array
 
 
 def _axes(shape: tuple[int, ...], vectors: dict[str, tuple[Column | None, np.ndarray]]) -> tuple[Axis, Axis] | None:
