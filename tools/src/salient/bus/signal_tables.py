@@ -52,7 +52,8 @@ class TableLog(DecodedLog):
                 if not dot or not len(signal := table[full_name]):
                     continue
                 values = table.exact(full_name) or signal.value.tolist()
-                for time_ns, value, text in zip(table.times_ns(full_name).tolist(), values, _names(signal), strict=True):
+                times_ns = table.times_ns(full_name).tolist()
+                for time_ns, value, text in zip(times_ns, values, _names(signal), strict=True):
                     yield time_ns, message, name, value, signal.unit, text
 
     def put_rows(self, rows: list[Row]) -> None:

@@ -1,5 +1,5 @@
-"""Frames of logs that are text, line by line: candump, ASC, TRC, BUSMASTER, what python-can prints, and CSV of SavvyCAN,
-CANedge's converter and python-can.
+"""Frames of logs that are text, line by line: candump, ASC, TRC, BUSMASTER, the print of python-can, and CSV of
+SavvyCAN, CANedge's converter and python-can.
 
 The readers of python-can lose what these keep: times below a microsecond since 1970 and negative ones, ASC without data
 bytes or with length codes above 8, error frames and version 1.2 of TRC; and they take a line that is cut off for a
