@@ -120,8 +120,8 @@ def _canedge() -> bytes:
     lines = ["TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes"]
     for time_ns, message in frames():
         if not message.is_remote_frame:
-            lines.append(f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000 // 1000:06};1;{message.arbitration_id:X};"
-                         f"{message.is_extended_id:d};8;8;0;{message.is_fd:d};{message.bitrate_switch:d};"
+            lines.append(f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000 // 1000:06};1;"
+                         f"{message.arbitration_id:X};{message.is_extended_id:d};8;8;0;{message.is_fd:d};{message.bitrate_switch:d};"
                          f"{bytes(message.data).hex().upper()}")
     return "\n".join([*lines, ""]).encode()
 
