@@ -11,6 +11,7 @@ from salient.bench.programs import image
 from salient.config import CONTROLLERS
 from salient.elf import ElfImage
 from salient.errors import UsageError
+from salient.paths import ROOT
 from salient.target import long_run
 from salient.target.bound import Model
 from salient.target.bound_facts import FILE, Facts, Names, read_facts
@@ -541,3 +542,17 @@ def test_each_variant_has_facts_of_its_configuration():
     known = {of.controller for of in long_run.VARIANTS.values()}
     named = [one.configurations for one in (*facts.loop, *facts.never, *facts.exclusive, *facts.at_most)]
     assert set().union(*(of for of in named if of is not None)) == known
+
+
+MORE_PHASES = {("five_phases", "traditional"): 970, ("five_phases", "paper"): 1170, ("five_phases", "salient"): 2800,
+               ("six_phases", "traditional"): 2430, ("six_phases", "paper"): 2630, ("six_phases", "salient"): 4880}
+"""Instructions of the control interrupt (docs/machines/file.md). Loops over six phases are unrolled four times, and
+each pass counts as four phases: the bound of six is too high."""
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize(("name", "controller"), MORE_PHASES)
+def test_five_and_six_phases_have_the_bound_that_the_documents_state(name, controller):
+    elf = ElfImage(image(str(ROOT / "tests" / "machines" / f"{name}.toml"), "cortex-m4"))
+    most = MORE_PHASES[name, controller]
+    assert 0.97 * most < Model(elf, read_facts(), controller).solve().instructions <= most

@@ -116,6 +116,24 @@ def _savvycan() -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
+def _canedge() -> bytes:
+    lines = ["TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes"]
+    for time_ns, message in frames():
+        if not message.is_remote_frame:
+            lines.append(f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000 // 1000:06};1;"
+                         f"{message.arbitration_id:X};{message.is_extended_id:d};8;8;0;{message.is_fd:d};{message.bitrate_switch:d};"
+                         f"{bytes(message.data).hex().upper()}")
+    return "\n".join([*lines, ""]).encode()
+
+
+def _printed() -> bytes:
+    lines = []
+    for time_ns, message in frames():
+        message.timestamp = (time_ns - START_NS) * 1e-9
+        lines.append(f"{message}\n")
+    return "".join(lines).encode()
+
+
 def _mf4() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mf4"
@@ -141,6 +159,8 @@ ORIGINALS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "trc": (".trc", _trc),
     "busmaster": (".log", _busmaster),
     "savvycan": (".csv", _savvycan),
+    "canedge": (".csv", _canedge),
+    "printed": (".txt", _printed),
     "blf": (".blf", lambda: in_containers(*_objects())),
     "blf_objects": (".blf", lambda: b"".join(_objects())),
     "gz": (".log.gz", lambda: gzip.compress(_written(CandumpLog, ".log"), mtime=0)),
@@ -232,7 +252,7 @@ def read(folder: Path, name: str, data: bytes) -> tuple[list[Timed], str]:
 def intact(name: str, first: int) -> int:
     """The number of frames before a byte."""
     data = original(name)
-    if name in ("candump", "asc", "trc", "busmaster", "savvycan"):
+    if name in ("candump", "asc", "trc", "busmaster", "savvycan", "canedge", "printed"):
         before = data[:first].split(b"\n")[:-1]
         in_all = sum(_is_frame(name, line) for line in data.split(b"\n"))
         assert in_all == len(expected(name)), (in_all, name)
@@ -262,7 +282,7 @@ def intact(name: str, first: int) -> int:
 
 def _is_frame(name: str, line: bytes) -> bool:
     return {"candump": b"#" in line, "asc": b" Rx " in line, "trc": b" Rx " in line, "busmaster": b" Rx " in line,
-            "savvycan": b",Rx," in line}[name]
+            "savvycan": b",Rx," in line, "canedge": line[:1].isdigit(), "printed": b"ID: " in line}[name]
 
 
 def check(folder: Path, name: str, number: int) -> str:

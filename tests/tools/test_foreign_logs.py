@@ -20,6 +20,7 @@ from salient.config import Rotation
 from salient.errors import RunFailed, UsageError
 
 FRAME_DATA = bytes(range(8))
+PRINTED = (b"", b"\1\2", b"AB", FRAME_DATA)
 ASC_HEADER = "date Mon Feb 3 08:15:00.000 am 2025\nbase {}  timestamps {}\ninternal events logged\n"
 FD = "CANFD  1 Rx 181   1 0 8 08 01 02 03 04 05 06 07 08 0 0 {} 0 0 0 0 0"
 
@@ -68,6 +69,22 @@ S = 1_000_000_000
         ("a.trc", ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n 1) 1.5 Rx 0123 2 01 02\n",
          [(43_200 * S + 1_500_000, 0x123, b"\1\2")]),
         ("a.trc", ";$FILEVERSION=1.2\n;$STARTTIME=25569\n 1) 1.5 1 Rx 00000123 1 01\n", [(1_500_000, 0x123, b"\1")]),
+        ("a.trc", ";$FILEVERSION=1.3\n;$STARTTIME=25569\n 1) 1.5 1 Rx 0123 - 1 01\n 2) 2.0 1 Event  a user's remark\n"
+         " 3) 2.5 1 Rx 0123 - 1 02\n", [(1_500_000, 0x123, b"\1"), (2_500_000, 0x123, b"\2")]),
+        ("a.trc", ";$FILEVERSION=2.0\n;$STARTTIME=25569,5\n;$COLUMNS=N,O,T,I,d,l,D\n 1 1,5 DT 0123 Rx 1 01\n"
+         " 2 2 EV a remark of a user\n 3 2,5 DT 0123 Rx 1 02\n",
+         [(43_200 * S + 1_500_000, 0x123, b"\1"), (43_200 * S + 2_500_000, 0x123, b"\2")]),
+        ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+         "1500000,0000021A,false,Rx,0,12,00,01,02,03,04,05,06,07,08,09,0A,0B,\n1600000,0000021A,false,Rx,0,1,2A,\n",
+         [(3 * S // 2, 0x21A, bytes(range(12))), (8 * S // 5, 0x21A, b"*")]),
+        ("a.csv", "TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes\n"
+         "1600000000.123450;1;14A;0;8;8;0;0;0;0102030405060708\n"
+         "1600000000.223450;2;18FEF100;1;9;12;1;1;1;0102030405060708090A0B0C\n",
+         [(1_600_000_000_123_450_000, 0x14A, bytes(range(1, 9))),
+          (1_600_000_000_223_450_000, 0x18FEF100, bytes(range(1, 13)))]),
+        ("a.txt", "".join(f"{can.Message(timestamp=number, arbitration_id=0x123, is_extended_id=number > 1, data=of)}\n"
+                          for number, of in enumerate(PRINTED)),
+         [(number * S, 0x123, data) for number, data in enumerate(PRINTED)]),
         ("a.csv", "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.5,0x12,1,0,0,1,Kg==\n",
          [(3 * S // 2, 0x12, b"*")]),
         ("a.log", "***BUSMASTER Ver 3***\n***HEX***\n23:59:59:0000 Rx 1 0x12 s 1 2A\n00:00:01:0000 Rx 1 0x12 s 1 2B\n",
@@ -90,6 +107,10 @@ def test_text_of_other_tools_is_read_with_all_frames(tmp_path, name, text, frame
         ("a.asc", ASC_HEADER.format("hex", "absolute") + " 0.5 1 11 Rx d 1 05\n 0.6 1 Engine Rx d 0\n", 1, "line 5"),
         ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n1,1,false,Rx,0,1,05\n2,1,false,Rx,0,80000000,05\n",
          1, "line 3"),
+        ("a.txt", f"{can.Message(data=b'1')}\n{can.Message(data=b'12')}"[:-30], 1,
+         "truncated: line 2: it has 1 data bytes and states 2"),
+        ("a.csv", "TimestampEpoch;BusChannel;ID;IDE;DLC;DataLength;Dir;EDL;BRS;DataBytes\n"
+         "1;1;1;0;1;1;0;0;0;01\n2;1;1;0;2;2;0;0;0;01\n", 1, "line 3"),
         ("a.trc", ";$FILEVERSION=1.1\n 1) 1.5 Rx 0123 1 01\n 2) 1.6 Rx 0123 2 01\n", 1, "line 3"),
     ],
 )
@@ -129,6 +150,30 @@ def test_flexible_data_rate_frame_of_blf_may_end_with_reserved_bytes(tmp_path, r
     item = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 32 + len(content), 100, 2, 0, 0, 5_000) + content
     read, line = found(tmp_path, "a.blf", in_containers(original("blf_objects")[:144], item, 1 << 17))
     assert (read, line) == ([(5_000, 0x123, bytes(range(64)))], "")
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".csv", ".db", ".log", ".mf4", ".txt"])
+def test_all_that_python_can_writes_is_read(tmp_path, suffix):
+    sent = [message for _, message in frames()]
+    with can.Logger(tmp_path / f"a{suffix}") as log:
+        for number, message in enumerate(sent):
+            message.timestamp = 1_700_000_000.0 + 0.01 * number
+            log(message)
+    read = list(read_log(tmp_path / f"a{suffix}"))
+    assert [(message.arbitration_id, message.is_remote_frame, bytes(message.data)) for _, message in read] == [
+        (message.arbitration_id, message.is_remote_frame, bytes(message.data)) for message in sent]
+    assert [1e-9 * time_ns for time_ns, _ in read] == pytest.approx([message.timestamp for message in sent], abs=2e-6)
+
+
+def test_frame_of_flexible_data_rate_is_read_from_a_database_of_python_can(tmp_path):
+    with can.Logger(tmp_path / "a.db") as log:
+        log(can.Message(timestamp=1.0, is_fd=True, data=bytes(12), dlc=12))
+    assert [(message.is_fd, len(message.data)) for _, message in read_log(tmp_path / "a.db")] == [(True, 12)]
+
+
+def test_frame_without_a_time_is_told(tmp_path):
+    with pytest.raises(UsageError, match="line 1: a frame without a time; candump writes it with -L or -ta"):
+        found(tmp_path, "a.txt", "  can0  123   [2]  01 02\n")
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".mf4"])

@@ -15,7 +15,7 @@ from salient.machine.file import load_machine
 from salient.machine.flux_map import ORIGIN_ERRORS, ORIGIN_TOLERANCE_RAD, FluxMapError
 from salient.machine.flux_map_csv import map_of_text
 from salient.machine.flux_map_origin import find_origin
-from salient.machine.map_import.command import map_text
+from salient.machine.map_import.command import map_text, read_points
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
 from salient.machine.map_import.mat import mat_points
@@ -92,6 +92,22 @@ LAYOUTS = {
     "mA and mWb without units": "angle,current,flux\n" + "\n".join(
         f"{angle:g},{1e3 * current:g},{1e3 * psi:.9g}" for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
         for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+    "remarks behind the rows": long_table(VALUES).replace("\n", " # of the bench\n"),
+    "currents in the names of the columns": matrix(VALUES, "theta").replace(
+        ",".join(f"{current:g}" for current in CURRENTS_A), ",".join(f"psi_{current:g}A" for current in CURRENTS_A)),
+    "numbers in the names of the columns": matrix(VALUES, "theta").replace(
+        ",".join(f"{current:g}" for current in CURRENTS_A), ",".join(f"Flux({current:g})" for current in CURRENTS_A)),
+    "units below the currents": matrix(VALUES, "Angle").replace(
+        "\n", "\n[deg]," + ",".join("[Wb]" for _ in CURRENTS_A) + "\n", 1),
+    "blocks by angle under comments": "\n\n".join(f"# theta = {angle:g} deg\n" + "\n".join(
+        f"{current:g} {psi:.9g}" for current, psi in zip(CURRENTS_A, fluxes, strict=True))
+        for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)),
+    "revolutions": "angle [rev],current [A],flux [Wb]\n" + "\n".join(
+        f"{angle / 360.0:.9g},{current:g},{psi:.9g}" for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+        for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
+    "thousands grouped, decimal points": "angle [deg];current [mA];flux [Wb]\n" + "\n".join(
+        f"{angle:g};{1e3 * current:,.0f};{psi:.9g}" for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
+        for current, psi in zip(CURRENTS_A, fluxes, strict=True)),
     "electrical radians": "theta_elec_rad,current_A,flux_Wb\n" + "\n".join(
         f"{math.radians(POLES * angle):.9g},{current:g},{psi:.9g}"
         for angle, fluxes in zip(ANGLES_DEG, VALUES, strict=True)
@@ -142,6 +158,47 @@ def test_mat_file_is_read_and_that_of_version_7_3_is_refused_in_a_line():
     assert deviation(correct(points, POLES, PHASES, SUPPLY)) < 5e-3
     with pytest.raises(FluxMapError, match=r"7\.3.*-v7"):
         mat_points(b"MATLAB 7.3 MAT-file")
+
+
+MATRICES = {
+    "of unknown names": {"x": ANGLES_DEG, "y": CURRENTS_A, "z": VALUES},
+    "with currents down": {"pos": np.radians(ANGLES_DEG), "cur": CURRENTS_A, "lambda_mWb": 1e3 * VALUES.T},
+    "of a mesh grid": {"TH": np.repeat(ANGLES_DEG[:, None], len(CURRENTS_A), 1), "PSI": VALUES,
+                       "II": np.repeat(CURRENTS_A[None], len(ANGLES_DEG), 0)},
+}
+
+
+@pytest.mark.parametrize("version", ["4", "5", "Octave"])
+@pytest.mark.parametrize("arrays", MATRICES)
+def test_matrices_are_read_from_files_of_all_versions(tmp_path, arrays, version):
+    path = tmp_path / "table.mat"
+    if version == "Octave":
+        path.write_text("# Created by Octave 6.2.0\n" + "\n\n".join(
+            f"# name: {name}\n# type: matrix\n# rows: {len(array)}\n# columns: {array.shape[1]}\n" + "\n".join(
+                " ".join(f"{value:.12g}" for value in row) for row in array)
+            for name, array in ((name, np.atleast_2d(of)) for name, of in MATRICES[arrays].items())))
+    else:
+        savemat(path, MATRICES[arrays], format=version)
+    assert deviation(correct(read_points(path), POLES, PHASES, SUPPLY)) < 5e-3
+
+
+@pytest.mark.parametrize("names", ["Flux_{}", "case {}", "psi{}"])
+def test_columns_that_are_only_counted_are_refused(names):
+    """Their first row was taken for the currents."""
+    head = ",".join(names.format(number + 1) for number in range(len(CURRENTS_A)))
+    with pytest.raises(FluxMapError, match=r"line 2: the header above it.* does not name .*'I=5A'"):
+        imported(matrix(VALUES, "theta").replace(",".join(f"{current:g}" for current in CURRENTS_A), head))
+
+
+@pytest.mark.parametrize(("name", "data", "way"), [
+    ("a.xlsx", b"PK\3\4" + bytes(range(256)), "a spreadsheet.*save the table as CSV"),
+    ("a.xls", b"\xd0\xcf\x11\xe0" + bytes(300), "a spreadsheet.*save the table as CSV"),
+    ("a.npy", b"\x93NUMPY" + bytes(300), r"an array of NumPy.*numpy\.savetxt"),
+])
+def test_file_that_is_no_text_says_what_it_is(tmp_path, name, data, way):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(FluxMapError, match=way):
+        read_points(tmp_path / name)
 
 
 def test_dip_is_refused_with_its_line():

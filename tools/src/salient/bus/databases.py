@@ -7,16 +7,19 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 
 import cantools
 from cantools.database.can import Database, Message
 
 from salient.bus.signals import FrameKey, big_endian_bit, drive_database, frame_key, rig_database
-from salient.errors import UsageError, shown
+from salient.errors import UsageError
+from salient.machine.map_import.text import decode
 
 OPTION = "--dbc"
 _REASON_MAX = 160  # characters of what the parser says
+_FRAME_BYTES_MAX = 64
 _BITS_MAX = 64
 """Length of a signal that is decoded."""
 
@@ -66,10 +69,7 @@ def _load(path: Path) -> Database:
         data = path.read_bytes()
     except OSError as error:
         raise UsageError(f"{OPTION} {path}: {error.strerror}") from None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("cp1252", errors="replace")  # the encoding of the format
+    text = decode(data)
     logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of is an error here
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, prune_choices=False)
@@ -80,34 +80,55 @@ def _load(path: Path) -> Database:
     if not database.messages:
         raise UsageError(f"{OPTION} {path}: no valid DBC: it defines no message")
     occurrences = Counter(map(frame_key, database.messages))
-    for message in database.messages:
+    for message in list(database.messages):
         if occurrences[frame_key(message)] > 1:
             raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name} has the identifier "
                              f"{identifier_text(*frame_key(message))} of another message of the file")
+        if message.length > _FRAME_BYTES_MAX:  # of a transport protocol: J1939, ISO 15765
+            _say(path, f"{message.name} has {message.length} bytes, a frame at most {_FRAME_BYTES_MAX}, and is left "
+                       "out")
+            database.messages.remove(message)
+            continue
         _check(path, message)
+        _name_signals(path, message)
+    if not database.messages:
+        raise UsageError(f"{OPTION} {path}: no valid DBC: it defines no message that a frame carries")
     return database
 
 
+def _say(path: Path, text: str) -> None:
+    print(f"salient: {OPTION} {path}: {text}", file=sys.stderr, flush=True)
+
+
 def _check(path: Path, message: Message) -> None:
-    """UsageError: a frame cannot carry the message. Signals that are too wide are left out, with a line."""
-    longest = 64 if message.is_fd or message.length > 8 else 8
-    if message.length > longest:
-        raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name} has {message.length} bytes, a frame at most "
-                         f"{longest}")
-    for signal in message.signals:
+    """Leaves signals out, with a line, that a frame of the message cannot carry or that have too many bits."""
+    for signal in list(message.signals):
         big_endian = signal.byte_order == "big_endian"
         first = big_endian_bit(signal) if big_endian else signal.start
+        reason = ""
         if not 0 <= first < first + signal.length <= 8 * message.length:
-            raise UsageError(f"{OPTION} {path}: no valid DBC: signal {shown(signal.name)} is beyond the "
-                             f"{message.length} bytes of {message.name}")
-        if signal.is_float and signal.length not in (16, 32, 64):
-            raise UsageError(f"{OPTION} {path}: no valid DBC: {message.name}.{signal.name} is a floating-point number "
-                             f"of {signal.length} bits")
-    wide = [signal for signal in message.signals if signal.length > _BITS_MAX]
-    for signal in wide:
-        print(f"salient: {OPTION} {path}: {message.name}.{signal.name} has {signal.length} bits, more than "
-              f"{_BITS_MAX}, and is left out", file=sys.stderr, flush=True)
-        message.signals.remove(signal)
+            reason = f"is beyond the {message.length} bytes of the message"
+        elif signal.is_float and signal.length not in (16, 32, 64):
+            reason = f"is a floating-point number of {signal.length} bits"
+        elif signal.length > _BITS_MAX:
+            reason = f"has {signal.length} bits, more than {_BITS_MAX},"
+        if reason:
+            _say(path, f"{message.name}.{signal.name} {reason} and is left out")
+            message.signals.remove(signal)
+
+
+def _name_signals(path: Path, message: Message) -> None:
+    """Gives signals of one name others by their number."""
+    names = {signal.name for signal in message.signals}
+    counts: Counter[str] = Counter()
+    for signal in message.signals:
+        counts[signal.name] += 1
+        if counts[signal.name] == 1:
+            continue
+        name = next(name for number in count(counts[signal.name]) if (name := f"{signal.name}_{number}") not in names)
+        _say(path, f"{message.name} has several signals {signal.name}; the one of bit {signal.start} is {name}")
+        names.add(name)
+        signal.name = name
 
 
 def _name_messages(database: Database, path: Path, label: str, names: set[str], reserved: Iterable[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from salient.bus.databases import messages_of
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_input import Damage, LogInput
 from salient.bus.mf4_reader import read_mf4
-from salient.bus.signals import frame_key
+from salient.bus.signals import FrameKey, FrameKeys, frame_key
 from salient.bus.text_logs import Frames, nanoseconds, read_text
 from salient.config import READABLE_SUFFIXES, Rotation, either
 from salient.errors import RunFailed, UsageError
@@ -40,6 +41,9 @@ class KnownFrames:
     def __init__(self, node: int | None, others: Sequence[Database] = ()) -> None:
         self._node = node
         self._lengths = {frame_key(message): message.length for message in messages_of(others)}
+        self._names = {frame_key(message): message.name for message in messages_of(others)}
+        self._keys = FrameKeys(messages_of(others))
+        self._short: dict[FrameKey, tuple[int, int]] = {}
         self._others: set[int] = set()
         self._count = 0
         self.found = False
@@ -47,10 +51,13 @@ class KnownFrames:
     def add(self, message: can.Message) -> None:
         """Takes a frame."""
         self._count += 1
-        if self.found or message.is_error_frame or message.is_remote_frame:
+        if (self.found and not self._lengths) or message.is_error_frame or message.is_remote_frame:
             return
-        length = self._lengths.get((message.arbitration_id, message.is_extended_id))
-        self.found = length is not None and length <= len(message.data)
+        of_file = self._keys.find(message.arbitration_id, message.is_extended_id)
+        length = self._lengths.get(of_file)
+        if length is not None and length > len(message.data):
+            self._short[of_file] = self._short.get(of_file, (0, 0))[0] + 1, len(message.data)
+        self.found = self.found or (length is not None and length <= len(message.data))
         if self.found or message.is_fd:
             return
         key = (message.arbitration_id, message.is_extended_id, len(message.data))
@@ -59,6 +66,12 @@ class KnownFrames:
         if not self.found and len(nodes) == 1:  # the time of the test bench is common to all drives
             self._others |= nodes
 
+    @property
+    def short(self) -> str:
+        """Messages of other nodes with fewer bytes than their database states, for a line; empty without any."""
+        return ", ".join(f"{count} frames of {self._names[key]} ({length} instead of {self._lengths[key]} bytes)"
+                         for key, (count, length) in sorted(self._short.items()))
+
     def require(self, where: str, end: str = "") -> None:
         """NoKnownFrame: there was none. end: of the message."""
         if self.found:
@@ -66,7 +79,8 @@ class KnownFrames:
         node = "" if self._node is None else f" with node number {self._node} (--node)"
         files = " or of the messages of --dbc" if self._lengths else ""
         others = f", but of node {' and '.join(map(str, sorted(self._others)))}" if self._others else ""
-        raise NoKnownFrame(f"{where}: none of {self._count} frames is of a drive{node}{files}{others}{end}")
+        short = f"; too short: {self.short}" if self._short else ""
+        raise NoKnownFrame(f"{where}: none of {self._count} frames is of a drive{node}{files}{others}{short}{end}")
 
 
 def convert(source: Path, target: Path, machine: str | None, node: int = 0, rotation: Rotation | None = None,
@@ -111,6 +125,8 @@ def convert(source: Path, target: Path, machine: str | None, node: int = 0, rota
     except OSError as error:
         raise UsageError(f"--out {target}: {error.strerror}") from None
     known.require(damage or f"--convert {source}", "" if decodes else f"; they are in {log.place}")
+    if decodes and known.short:
+        print(f"salient: --convert {source}: left out as too short for --dbc: {known.short}", file=sys.stderr)
     if damage:
         raise LogDamaged(f"{damage}, which are in {log.place}")
     return count, log.place
@@ -168,7 +184,8 @@ def _check(time_ns: int, message: can.Message, count: int) -> None:
 
 
 def _read_database(path: Path) -> Frames:
-    """The frames of an SQLite file that python-can has written; it has no flexible data rate, and times as floats."""
+    """The frames of an SQLite file that python-can has written; it does not say that a frame has a flexible data rate,
+    and has times as floats."""
     connection = sqlite3.connect(f"file:{path.resolve().as_posix().replace('?', '%3f').replace('#', '%23')}?mode=ro",
                                  uri=True)
     count = 0
@@ -178,7 +195,8 @@ def _read_database(path: Path) -> Frames:
             count += 1
             yield nanoseconds(repr(float(time_s))), can.Message(
                 arbitration_id=int(identifier), is_extended_id=bool(extended), is_remote_frame=bool(remote),
-                is_error_frame=bool(error), dlc=int(dlc), data=b"" if remote else bytes(data or b""))
+                is_error_frame=bool(error), is_fd=len(data or b"") > 8, dlc=int(dlc),
+                data=b"" if remote else bytes(data or b""))
     except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
         raise Damage(f"after row {count}: {error}") from None
     finally:

@@ -20,7 +20,7 @@ from salient.bus.interface import closed_in_order
 from salient.bus.log import DECODED_SUFFIXES, open_log
 from salient.bus.log_reader import read_log
 from salient.bus.selected_signals import SelectedSignals
-from salient.bus.signals import SignalTable, drive_database, frame_key, rig_database
+from salient.bus.signals import FrameKeys, SignalTable, drive_database, rig_database
 from salient.bus.traffic import Traffic
 from salient.bus.traffic_text import event_line, load_text, report_lines
 from salient.config import Rotation
@@ -215,7 +215,7 @@ class _Nodes:
         self._address = address
         self._wanted = wanted
         self._heard: set[int] = set()
-        self._of_files = set(map(frame_key, messages_of(others)))
+        self._of_files = FrameKeys(messages_of(others))
         self._others_heard = False
         self._traffic = traffic
         self._from_ns: int | None = None
@@ -235,7 +235,8 @@ class _Nodes:
         """Takes a frame; tells when the drive has been absent for _ABSENT_S since the first one."""
         if not self.absent:
             return
-        self._others_heard = self._others_heard or (message.arbitration_id, message.is_extended_id) in self._of_files
+        self._others_heard = self._others_heard or self._of_files.find(
+            message.arbitration_id, message.is_extended_id) in self._of_files.exact
         node = None if message.is_extended_id or not has_plain_data(message) else nodes_of_drives().get(
             message.arbitration_id)
         if node is not None:
@@ -268,7 +269,7 @@ class _Nodes:
         if self.nothing and not self._told:
             heard = " and ".join(map(str, sorted(self._heard)))
             others = f", but of node {heard}" if heard else " or of any other drive"
-            files = " or of the messages of --dbc" if self._of_files else ""
+            files = " or of the messages of --dbc" if self._of_files.exact else ""
             print(f"salient: {self._address}: no frame of a drive with node number {self._wanted} (--node){files}"
                   f"{others}{end}", file=sys.stderr, flush=True)
             self._told = True

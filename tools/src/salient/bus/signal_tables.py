@@ -19,10 +19,13 @@ from salient.errors import optional_package
 _BATCH_FRAMES = 20_000
 _HELD_MAX = 1_000_000
 """Frames, of 16 bytes each, that wait until the drive says which machine it carries; it does each 100 ms."""
+_VALUE = 3  # its column
+_WHOLE_MAX = 1 << 53
 _COLUMNS = ("time_s", "message", "signal", "value", "unit", "name")
 
 Row = tuple[int, str, str, float, str, str]
-"""Time in ns, message, signal, value, unit, and the name of the value where it has one."""
+"""Time in ns, message, signal, value (whole where a float would round it), unit, and the name of the value where it has
+one."""
 
 
 class TableLog(DecodedLog):
@@ -48,8 +51,9 @@ class TableLog(DecodedLog):
                 message, dot, name = full_name.partition(".")
                 if not dot or not len(signal := table[full_name]):
                     continue
-                for time_ns, value, text in zip(table.times_ns(full_name).tolist(), signal.value.tolist(),
-                                                _names(signal), strict=True):
+                values = table.exact(full_name) or signal.value.tolist()
+                times_ns = table.times_ns(full_name).tolist()
+                for time_ns, value, text in zip(times_ns, values, _names(signal), strict=True):
                     yield time_ns, message, name, value, signal.unit, text
 
     def put_rows(self, rows: list[Row]) -> None:
@@ -83,7 +87,7 @@ class CsvLog(TableLog):
     def put_rows(self, rows: list[Row]) -> None:
         text = StringIO()
         table = csv.writer(text, lineterminator="\n")
-        table.writerows((_seconds(time_ns), message, signal, f"{value:.10g}", unit, name)
+        table.writerows((_seconds(time_ns), message, signal, _text(value), unit, name)
                         for time_ns, message, signal, value, unit, name in rows)
         self._write(text.getvalue())
 
@@ -93,6 +97,14 @@ class CsvLog(TableLog):
 
     def _finish(self) -> None:
         self._file.close()
+
+
+def _text(value: float) -> str:
+    """All digits that a value has, without the rounding of its factor."""
+    if isinstance(value, int) or (value.is_integer() and abs(value) < _WHOLE_MAX):
+        return str(int(value))
+    short = f"{value:.10g}"
+    return short if abs(float(short) - value) <= 1e-14 * abs(value) else repr(value)
 
 
 def _seconds(time_ns: int) -> str:
@@ -117,6 +129,7 @@ class ParquetLog(TableLog):
     def put_rows(self, rows: list[Row]) -> None:
         if rows:
             columns = [list(column) for column in zip(*rows, strict=True)]
+            columns[_VALUE] = [float(value) for value in columns[_VALUE]]
             self._writer.write_table(self._arrow.table(columns, schema=self._schema))
 
     def _finish(self) -> None:

@@ -21,6 +21,8 @@ from salient.paths import DRIVE_DBC, RIG_DBC
 
 FrameKey = tuple[int, bool]
 _TIME_BYTES, _WORD_BYTES = 8, 8
+_FLOAT_BITS = 53
+_NULL_ADDRESS, _BROADCAST_FORMAT = 0xFE, 240  # J1939-81, J1939-21
 
 
 @lru_cache
@@ -189,6 +191,14 @@ class SignalTable(Mapping[str, Signal]):
             signal = multiplexer
         return frames, time_ns
 
+    def exact(self, name: str) -> list[int] | None:
+        """Whole values of a signal whose bits are more than the ones of a float; None of another one."""
+        signal = self._names[name][1]
+        scale, offset = float(signal.scale), float(signal.offset)
+        if signal.is_float or signal.length <= _FLOAT_BITS or not (scale.is_integer() and offset.is_integer()):
+            return None
+        return [int(scale) * value + int(offset) for value in whole(self._columns(name)[0], signal).tolist()]
+
     def times_ns(self, name: str) -> np.ndarray:
         """Times of a signal without the rounding to the floats of `Signal`."""
         return self._columns(name)[1]
@@ -239,8 +249,12 @@ class BusSignals(SignalTable):
     """The signals of a database of other nodes: flexible data rate frames count, and frames that are longer than the
     message, as frames of a flexible data rate have to be."""
 
+    def __init__(self, database: Database) -> None:
+        super().__init__(database)
+        self._keys = FrameKeys(database.messages)
+
     def add(self, time_ns: int, message: can.Message) -> None:
-        key = (message.arbitration_id, message.is_extended_id)
+        key = self._keys.find(message.arbitration_id, message.is_extended_id)
         length = self._length.get(key)
         if length is None or length > len(message.data) or message.is_remote_frame or message.is_error_frame:
             return
@@ -253,6 +267,35 @@ class BusSignals(SignalTable):
 def frame_key(message: Message) -> FrameKey:
     """Key of the frames of a message of a database: identifier, and whether it is extended."""
     return message.frame_id, message.is_extended_frame
+
+
+class FrameKeys:
+    """The messages to which frames belong. A message of J1939 (VFrameFormat J1939PG) whose source is the null address,
+    as in databases of the standard, comes from any source with any priority, one for a destination to any."""
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        listed = list(messages)
+        self.exact = {frame_key(message) for message in listed}
+        self._groups = {group_of(message.frame_id): frame_key(message) for message in listed
+                        if is_of_any_source(message)}
+        self.of_any_source = frozenset(self._groups.values())
+
+    def find(self, identifier: int, is_extended: bool) -> FrameKey:
+        """The key of the message of an identifier, itself where there is none."""
+        key = identifier, is_extended
+        if not is_extended or not self._groups or key in self.exact:
+            return key
+        return self._groups.get(group_of(identifier), key)
+
+
+def is_of_any_source(message: Message) -> bool:
+    """Whether frames of a message come from any source address."""
+    return message.protocol == "j1939" and message.is_extended_frame and message.frame_id & 0xFF == _NULL_ADDRESS
+
+
+def group_of(identifier: int) -> int:
+    """Parameter group of a J1939 identifier, without source, priority and destination."""
+    return identifier & (0x03FFFF00 if identifier >> 16 & 0xFF >= _BROADCAST_FORMAT else 0x03FF0000)
 
 
 def names_of_values(signal: cantools.database.can.Signal) -> dict[float, str] | None:
@@ -275,14 +318,22 @@ def multiplexer_of(message: Message, signal: cantools.database.can.Signal) -> ca
 
 def physical(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
     """Physical values of a signal, as floats. frames: see raw_bits."""
-    field = raw_bits(frames, signal)
     if signal.is_float:
         bits = {16: "<u2", 32: "<u4", 64: "<u8"}[signal.length]
-        field = field.astype(bits).view(bits.replace("u", "f")).astype(float)
-    elif signal.is_signed and signal.length <= 64:
-        shift = np.int64(64 - signal.length)
-        field = (field.astype(np.int64) << shift) >> shift
+        field = raw_bits(frames, signal).astype(bits).view(bits.replace("u", "f")).astype(float)
+    else:
+        field = whole(frames, signal)
     return field * float(signal.scale) + float(signal.offset)
+
+
+def whole(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
+    """The bits of a signal as whole numbers, with its sign. frames: see raw_bits."""
+    field = raw_bits(frames, signal)
+    if not signal.is_signed:
+        return field
+    shift = np.int64(64 - signal.length)
+    signed: np.ndarray = (field.astype(np.int64) << shift) >> shift
+    return signed
 
 
 def big_endian_bit(signal: cantools.database.can.Signal) -> int:

@@ -1,4 +1,5 @@
-"""Frames of logs that are text, line by line: candump, ASC, TRC, BUSMASTER, and CSV of SavvyCAN and python-can.
+"""Frames of logs that are text, line by line: candump, ASC, TRC, BUSMASTER, the print of python-can, and CSV of
+SavvyCAN, CANedge's converter and python-can.
 
 The readers of python-can lose what these keep: times below a microsecond since 1970 and negative ones, ASC without data
 bytes or with length codes above 8, error frames and version 1.2 of TRC; and they take a line that is cut off for a
@@ -70,6 +71,8 @@ def _read_candump(lines: Iterator[Line], file: LogInput) -> Frames:
             continue
         match = _CANDUMP.fullmatch(_COLOUR.sub("", line.text))
         if match is None:
+            if _CANDUMP.fullmatch(f"(0) {line.text}"):
+                raise line.damage("a frame without a time; candump writes it with -L or -ta")
             raise line.damage(f"{line.text.strip()[:_SHOWN]!r} is no frame as candump writes it")
         try:
             message = _logged(match) if match["identifier"] else _shown(match)
@@ -273,7 +276,8 @@ class _Trc:
             elif not value.startswith("2."):
                 raise ValueError(f"version {value[:_SHOWN]!r} is not known of TRC")
         elif name == ";$STARTTIME":
-            self.start_ns = round(nanoseconds(str((Decimal(value) - _TRC_EPOCH_DAYS) * 86400)), -3)  # as its digits are
+            days = Decimal(value.replace(",", ".")) - _TRC_EPOCH_DAYS
+            self.start_ns = round(nanoseconds(str(days * 86400)), -3)  # as its digits are
         elif name == ";$COLUMNS":
             self.columns = value.split(",")
             if not {"O", "T", "I"} <= set(self.columns) or not {"l", "L"} & set(self.columns):
@@ -284,13 +288,15 @@ class _Trc:
         words = text.split()
         fields = dict(zip(self.columns, words, strict=False))
         kind = fields.get("T", "Rx")
+        if kind in ("EV", "Event"):  # a remark of the user, without the other columns
+            return None
         length = int(fields.get("l") or fields["L"])
         rest = words[self.columns.index("D"):] if "D" in self.columns else words[len(self.columns):]
         time_ns = self.start_ns + nanoseconds(fields["O"], 1000)
         if self.version.startswith("1."):
             return self._first(kind, fields["I"], length, rest, time_ns)
         if kind not in ("DT", "RR", "ER", *_TRC_FLEXIBLE):
-            if kind not in ("ST", "EC", "EV"):
+            if kind not in ("ST", "EC"):
                 raise ValueError(f"type {kind[:_SHOWN]!r} is not of TRC")
             return None
         if kind == "ER":
@@ -383,19 +389,49 @@ def _read_busmaster(lines: Iterator[Line], file: LogInput) -> Frames:
             is_remote_frame=is_remote, dlc=length, data=b"" if is_remote else data)
 
 
+# --- python-can's print ----------------------------------------------------------------------------------------------
+
+_PRINTED = re.compile(
+    r"Timestamp:\s+(?P<time>-?\d+\.\d+)\s+ID:\s+(?P<identifier>[\dA-F]+)\s+(?P<kind>[SX])\s+(?P<way>[RT]x)"
+    r" (?P<error>[E ]) (?P<remote>[R ]) (?P<fd>[F ]) (?P<brs>BS|  ) (?P<esi>EI|  )\s+DL:\s+(?P<length>\d+)"
+    r"(?:\s+(?P<data>[\dA-F]{2}(?: [\dA-F]{2})*)(?=\s|$))?(?:\s+'[^']*')?(?:\s+Channel: .*)?",
+    re.ASCII | re.IGNORECASE)
+
+
+def _read_printed(lines: Iterator[Line], file: LogInput) -> Frames:
+    """Frames as `can_logger` prints them without a file, or writes them to one that ends with .txt."""
+    for line in lines:
+        text = line.text.strip()
+        match = _PRINTED.fullmatch(text)
+        if match is None:
+            raise line.damage(f"{text[:_SHOWN]!r} is no frame as python-can prints it")
+        is_remote, is_error, length = match["remote"] == "R", match["error"] == "E", int(match["length"])
+        data = bytes.fromhex(match["data"] or "")
+        if not is_remote and not is_error and len(data) != min(length, 64 if match["fd"] == "F" else 8):
+            raise line.damage(f"it has {len(data)} data bytes and states {length}")
+        yield nanoseconds(match["time"]), can.Message(
+            arbitration_id=int(match["identifier"], 16), is_extended_id=match["kind"] == "X", is_error_frame=is_error,
+            is_remote_frame=is_remote, is_fd=match["fd"] == "F", bitrate_switch=match["brs"] == "BS",
+            error_state_indicator=match["esi"] == "EI", is_rx=match["way"] == "Rx", dlc=length, data=data)
+
+
 # --- CSV --------------------------------------------------------------------------------------------------------------
 
 
 def _read_csv(lines: Iterator[Line], file: LogInput) -> Frames:
-    """Frames by SavvyCAN, with times in us, and of python-can, with data in base 64."""
+    """Frames by SavvyCAN, with times in us; by CANedge's converter; and by python-can, with data in base 64."""
     header = next(lines)
-    names = [name.strip().lower() for name in header.text.split(",")]
-    read = next((reader for columns, reader in ((_SAVVY_COLUMNS, _savvy), (_PYTHON_CAN_COLUMNS, _python_can))
-                 if columns <= set(names)), None)
+    separator = ";" if header.text.count(";") > header.text.count(",") else ","
+    names = [name.strip().lower() for name in header.text.split(separator)]
+    read = next((reader for columns, reader in (
+        (_SAVVY_COLUMNS, _savvy), (_CANEDGE_COLUMNS, _canedge), (_PYTHON_CAN_COLUMNS, _python_can))
+        if columns <= set(names)), None)
     if read is None:
-        raise header.damage("its columns are neither SavvyCAN's nor python-can's")
+        raise header.damage("its columns are neither SavvyCAN's nor CANedge's nor python-can's")
+    if read is _savvy:  # the head ends with D8, the rows of a flexible data rate do not
+        names = [*names[: names.index("d1")], *(f"d{number}" for number in range(1, 65))]
     for line in lines:
-        fields = [field.strip() for field in line.text.split(",")]
+        fields = [field.strip() for field in line.text.split(separator)]
         try:
             timed = read(dict(zip(names, fields, strict=False)), line.is_ended)
         except (ValueError, KeyError, binascii.Error):
@@ -404,6 +440,7 @@ def _read_csv(lines: Iterator[Line], file: LogInput) -> Frames:
 
 
 _SAVVY_COLUMNS = {"time stamp", "id", "extended", "len", "d1"}
+_CANEDGE_COLUMNS = {"timestampepoch", "id", "ide", "datalength", "databytes"}
 _PYTHON_CAN_COLUMNS = {"timestamp", "arbitration_id", "extended", "remote", "error", "dlc", "data"}
 
 
@@ -416,6 +453,20 @@ def _savvy(row: dict[str, str], is_ended: bool) -> tuple[int, can.Message]:
     return nanoseconds(row["time stamp"], 1_000_000), can.Message(
         arbitration_id=int(row["id"], 16), is_extended_id=_flag(row["extended"]), is_fd=is_fd,
         is_rx=row.get("dir", "Rx").lower() == "rx", dlc=length, data=data)
+
+
+def _canedge(row: dict[str, str], is_ended: bool) -> tuple[int, can.Message]:
+    length = int(row["datalength"])
+    data = bytes.fromhex(row["databytes"])
+    is_fd = _flag(row.get("edl") or "0") or length > 8
+    is_remote = _flag(row.get("rtr") or "0")
+    if not is_remote and len(data) != length:
+        raise ValueError("length")
+    return nanoseconds(row["timestampepoch"]), can.Message(
+        arbitration_id=int(row["id"], 16), is_extended_id=_flag(row["ide"]), is_fd=is_fd, is_remote_frame=is_remote,
+        bitrate_switch=is_fd and _flag(row.get("brs") or "0"), error_state_indicator=is_fd and _flag(
+            row.get("esi") or "0"),
+        is_rx=row.get("dir", "0") == "0", dlc=length, data=b"" if is_remote else data)
 
 
 def _python_can(row: dict[str, str], is_ended: bool) -> tuple[int, can.Message]:
@@ -439,7 +490,8 @@ _SIGNS: tuple[tuple[re.Pattern[str], _Reader], ...] = (
     (re.compile(r"\s*;"), _read_trc),
     (re.compile(r"\s*\("), _read_candump),
     (re.compile(r"\s*(date|base)\s", re.IGNORECASE), _read_asc),
-    (re.compile(r"\s*time ?stamp,", re.IGNORECASE), _read_csv),
+    (re.compile(r"\s*time ?stamp(epoch)?\s*[,;]", re.IGNORECASE), _read_csv),
+    (re.compile(r"\s*Timestamp:\s"), _read_printed),
 )
 _OF_SUFFIX: dict[str, _Reader] = {".asc": _read_asc, ".log": _read_candump, ".txt": _read_candump, ".trc": _read_trc,
                                   ".csv": _read_csv}

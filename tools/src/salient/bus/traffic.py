@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import can
 from cantools.database.can import Database, Message
 
-from salient.bus.databases import identifier_text, node_of
+from salient.bus.databases import identifier_text, messages_of, node_of
 from salient.bus.frame_bits import BitRates
-from salient.bus.signals import FrameKey, drive_database, frame_key, rig_database
+from salient.bus.signals import FrameKey, FrameKeys, drive_database, frame_key, rig_database
 from salient.config import NODE_MAX
 from salient.dbc import attributes
 
@@ -163,11 +163,12 @@ class Traffic:
         """databases: of load_databases. node: of the drive; messages of the other node numbers are known, too."""
         self._rates = rates
         self._known = known_messages(node, databases)
+        self._keys = FrameKeys(messages_of(databases))
         self._off_bus = _rig_identifiers()
         self._entries: dict[FrameKey, _Entry] = {}
         self._by_node: dict[str, dict[FrameKey, _Entry]] = {}
         for key, definition in sorted(self._known.items()):
-            if definition.is_of_file or definition.node == _DRIVE:
+            if (definition.is_of_file or definition.node == _DRIVE) and key not in self._keys.of_any_source:
                 self._new_entry(key)
         self._unknown: dict[FrameKey, _Entry] = {}
         self._further_unknown = 0
@@ -217,8 +218,8 @@ class Traffic:
 
     def _new_entry(self, key: FrameKey) -> _Entry | None:
         """The entry of an identifier that comes for the first time; None for an unknown one beyond the limit."""
-        definition = self._known.get(key)
-        if definition is not None:
+        definition = self._known.get(self._keys.find(*key))
+        if definition is not None and (key in self._known or len(self._entries) < len(self._known) + _UNKNOWN_MAX):
             entry = self._entries[key] = _Entry(definition, definition.cycle_ns)
             self._by_node.setdefault(definition.node, {})[key] = entry
             return entry

@@ -9,7 +9,7 @@ zero. The unaligned end does not count: poles begin to overlap near it, and the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,9 @@ WHOLE_RAD = 1.5 * math.pi
 _CANDIDATES = 180  # over half a pitch
 _UNEVEN_CANDIDATES = 15  # to either side of the position of the even sums
 _PARTS = (0.1, 0.15, 0.2, 0.27)  # of half a pitch, at its aligned end
+_POWERS = (2, 3, 4, 5)
+_BEST = 2.0
+_ERROR_LEAST_RAD = 1e-4  # of one polynomial
 _SIGHT_RAD = math.pi / 6.0  # in which the position is sought there
 
 
@@ -61,33 +64,55 @@ def _by_halves(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
 
 
 def _by_end(angle_rad: np.ndarray, scaled: np.ndarray) -> Origin:
-    """From even parabolas through the points near the aligned position: the mean of several widths and degrees, by
-    their variances, and their scatter."""
+    """From even polynomials through the points near the aligned position: the mean of several widths and degrees, by
+    their variances, and their scatter. The low degrees, which have one minimum, find the place; the high ones, which
+    have more, tell it closer there."""
     aligned_rad = float(angle_rad[np.argmax(np.sum(scaled, axis=1))])
+    sight_rad = _SIGHT_RAD * np.linspace(-1.0, 1.0, 31)
+    first = _ends(angle_rad, scaled, aligned_rad, (2, 3), aligned_rad + sight_rad)
+    if not first:
+        return Origin(math.remainder(aligned_rad, 2.0 * math.pi), _SIGHT_RAD)
+    near_rad, error_rad = _mean(first)
+    step_rad = float(np.median(np.diff(angle_rad)))
+    if angle_rad[0] <= near_rad <= angle_rad[-1]:
+        close_rad = min(error_rad, _SIGHT_RAD) * np.linspace(-1.0, 1.0, 15)
+        found = [each for each in _ends(angle_rad, scaled, aligned_rad, _POWERS, near_rad + close_rad)
+                 if abs(each[0] - near_rad) < close_rad[-1]] or first
+        # Errors of polynomials lie on one side: the worse ones would pull.
+        least_rad = min(error for _, error in found)
+        best = [each for each in found if each[1] <= _BEST * least_rad]
+        near_rad, error_rad = _mean(best)[0], _mean(found)[1]
+    unseen_rad = (0.1 if len(first) >= len(_PARTS) else 1.0) * step_rad  # few widths have no scatter to tell
+    return Origin(math.remainder(near_rad, 2.0 * math.pi), error_rad + unseen_rad)
+
+
+def _ends(angle_rad: np.ndarray, scaled: np.ndarray, aligned_rad: float, powers: Sequence[int], candidates: np.ndarray
+          ) -> list[tuple[float, float]]:
+    """Position and error by the polynomials of each width and number of powers, near the best of some candidates."""
     found = []
     for part in _PARTS:
         chosen = np.abs(angle_rad - aligned_rad) <= part * math.pi
-        for powers in (2, 3):
-            freedom = int(np.sum(chosen)) - powers - 1
+        for number in powers:
+            freedom = int(np.sum(chosen)) - number - 1
             if freedom < 1:
                 continue
 
-            def squares(at: float, chosen: np.ndarray = chosen, powers: int = powers) -> float:
-                return _even_squares(angle_rad[chosen] - at, scaled[chosen], powers)
+            def squares(at: float, chosen: np.ndarray = chosen, number: int = number) -> float:
+                return _even_squares(angle_rad[chosen] - at, scaled[chosen], number)
 
-            candidates = aligned_rad + np.linspace(-_SIGHT_RAD, _SIGHT_RAD, 31)
             near_rad = float(candidates[np.argmin([squares(at) for at in candidates])])
-            least_rad, least, curvature = _least(near_rad, _SIGHT_RAD / 15.0, squares)
-            found.append((least_rad, max(2.0 * _deviation_rad(least, curvature, freedom), 1e-3)))
-    if not found:
-        return Origin(math.remainder(aligned_rad, 2.0 * math.pi), _SIGHT_RAD)
+            least_rad, least, curvature = _least(near_rad, float(candidates[1] - candidates[0]), squares)
+            found.append((least_rad, max(2.0 * _deviation_rad(least, curvature, freedom), _ERROR_LEAST_RAD)))
+    return found
+
+
+def _mean(found: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Mean of positions by their errors, and its error: the least one, and their scatter."""
     values, errors = np.array(found).T
     weights = errors**-2.0 / np.sum(errors**-2.0)
     mean_rad = float(weights @ values)
     scatter_rad = math.sqrt(float(weights @ (values - mean_rad) ** 2))
-    step_rad = float(np.median(np.diff(angle_rad)))
-    unseen_rad = (0.1 if len(found) >= len(_PARTS) else 1.0) * step_rad  # few widths have no scatter to tell
-    return Origin(math.remainder(mean_rad, 2.0 * math.pi), float(np.min(errors)) + 2.0 * scatter_rad + unseen_rad)
+    return mean_rad, float(np.min(errors)) + 2.0 * scatter_rad
 
 
 def _even_squares(angle_rad: np.ndarray, scaled: np.ndarray, powers: int) -> float:

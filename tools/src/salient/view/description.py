@@ -12,7 +12,15 @@ from cantools.database.can import Database, Message, Signal
 
 from salient.bench.faults import FaultKind, fault_kinds
 from salient.bus.databases import messages_of
-from salient.bus.signals import big_endian_bit, drive_database, is_enumeration, rig_database, signal_range
+from salient.bus.signals import (
+    big_endian_bit,
+    drive_database,
+    group_of,
+    is_enumeration,
+    is_of_any_source,
+    rig_database,
+    signal_range,
+)
 from salient.dbc import database_hash
 from salient.errors import UsageError
 from salient.machine.drive_data import derive
@@ -76,6 +84,7 @@ def _message(message: Message, *, is_of_file: bool = False) -> dict[str, Any]:
         "node": message.senders[0], "length": message.length, "comment": message.comment or "",
         "signals": [_signal(signal) for signal in message.signals],
         **({"may_be_longer": True} if is_of_file else {}),
+        **({"group": group_of(message.frame_id)} if is_of_file and is_of_any_source(message) else {}),
     }
 
 

@@ -7,7 +7,8 @@ import re
 from dataclasses import dataclass
 
 _ANGLE = {"deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad", "radian": "rad",
-          "radians": "rad", "mrad": "mrad", "mdeg": "mdeg"}
+          "radians": "rad", "mrad": "mrad", "mdeg": "mdeg", "rev": "rev", "revs": "rev",
+          "turn": "rev", "turns": "rev", "revolutions": "rev"}
 _CURRENT = {"a": 1.0, "amp": 1.0, "amps": 1.0, "ampere": 1.0, "amperes": 1.0, "ma": 1e-3, "ka": 1e3}
 _FLUX = {name: factor for prefix, factor in (("", 1.0), ("m", 1e-3), ("u", 1e-6), ("µ", 1e-6), ("μ", 1e-6))
          for name in (prefix + unit for unit in (
@@ -33,7 +34,7 @@ class Column:
 
     role: str
     unit: str | None = None
-    """Unit of an angle: deg, rad, mdeg or mrad, with "electrical " before it where the name says so."""
+    """Unit of an angle: deg, rad, mdeg, mrad or rev, with "electrical " before it where the name says so."""
     factor: float | None = None
     """To A, Wb or H; None where no unit is stated."""
 
@@ -72,7 +73,7 @@ def _by_unit(unit: str, name: str) -> Column | None:
 def condition(name: str) -> tuple[Column, float] | None:
     """The current or angle that a header or title states for its values: I='5A', current = 5 A, 10 deg, 2.5mA."""
     for label, text, unit in reversed(re.findall(
-            r"([^\W\d]\w*)?\s*[=:@]?\s*'?([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\W\d]+|°)?", name)):
+            r"([^\W\d](?:\w*[^\W\d])?)?\s*[=:@]?\s*'?([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\W\d]+|°)?", name)):
         value = float(text.replace(",", "."))
         by_unit = _by_unit(unit.lower(), label.lower()) if unit else None
         meaning = by_unit or (column(label) if label else None)
@@ -83,5 +84,6 @@ def condition(name: str) -> tuple[Column, float] | None:
 
 def radians(unit: str, rotor_poles: int) -> float:
     """Factor of an angle's unit to electrical radians."""
-    factor = {"deg": math.pi / 180.0, "rad": 1.0, "mdeg": math.pi / 180e3, "mrad": 1e-3}[unit.rsplit(maxsplit=1)[-1]]
+    factor = {"deg": math.pi / 180.0, "rad": 1.0, "mdeg": math.pi / 180e3, "mrad": 1e-3,
+              "rev": 2.0 * math.pi}[unit.rsplit(maxsplit=1)[-1]]
     return factor if unit.startswith("electrical") else factor * rotor_poles

@@ -13,9 +13,15 @@ from salient.machine.flux_map import FluxMapError
 from salient.machine.flux_map_csv import FILE_BYTES_MAX, map_of_text
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
-from salient.machine.map_import.mat import is_mat, mat_points
+from salient.machine.map_import.mat import is_mat, is_octave, mat_points, octave_points
 from salient.machine.map_import.text import blocks, decode
 from salient.toml_file import TextFileError, read_bytes, read_text, read_toml, validate
+
+_BINARY = {b"PK\x03\x04": ("a spreadsheet or another ZIP file", "save the table as CSV"),
+           b"\xd0\xcf\x11\xe0": ("a spreadsheet of an old Excel", "save the table as CSV"),
+           b"\x93NUMPY": ("an array of NumPy", "write it with numpy.savetxt"),
+           b"%PDF": ("a PDF", "export the table as CSV")}
+"""By their first bytes."""
 
 
 def import_map(machine: Path, table: Path, out: Path) -> tuple[Path, list[str]]:
@@ -58,7 +64,13 @@ def read_points(table: Path) -> Points:
         data = read_bytes(table, FILE_BYTES_MAX)
     except TextFileError as error:
         raise FluxMapError(str(error)) from None
-    return mat_points(data) if is_mat(data) else points_of(blocks(decode(data)))
+    if is_mat(data, table.suffix):
+        return mat_points(data)
+    for sign, (kind, way) in _BINARY.items():
+        if data.startswith(sign):
+            raise FluxMapError(f"{kind}, which is not read; {way}")
+    text = decode(data)
+    return octave_points(text) if is_octave(text) else points_of(blocks(text))
 
 
 def map_text(imported: Imported, source: str, stator_poles: int, rotor_poles: int) -> str:

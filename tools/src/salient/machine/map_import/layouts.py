@@ -141,8 +141,8 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
     width = max(len(row.cells) for row in block.rows)
     roles = [meaning.role if meaning else None for meaning in columns]
     conditions = [condition(cell) if re.search(r"\d", cell) else None for cell in block.header]
-    stated = next((found for title in block.titles if (found := condition(title)) and (
-        (len(title) < 60 and not block.header) or title != " ".join(block.header))), None)
+    stated = next((found for title in block.titles if (found := condition(title)) and len(title) < _TITLE_MAX and (
+        not block.header or title != " ".join(block.header) or len(re.findall(r"\d[\d.,eE+-]*", title)) == 1)), None)
     if len(columns) == width and {"angle", "current"} <= set(roles) and {"flux", "inductance"} & set(roles):
         _long(points, block, columns, phase)
     elif len(columns) == width and {"angle", "current", "other"} <= set(roles):
@@ -154,6 +154,12 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
         _matrix_with_head(points, block, phase)
     elif stated is not None and width == 2:
         _one_curve(points, block, columns, stated, phase)
+    elif len(block.header) == width > 4 and (numbered := _numbered(block.header)):
+        _matrix_with_head(points, Block(block.titles, numbered, block.rows), phase)
+    elif len(block.header) == width > 4 and sum(number(cell) is None for cell in block.header) > 2:
+        raise FluxMapError(f"line {block.rows[0].line}: the header above it, {', '.join(block.header)!r:.80}, does not"
+                           " name an angle, a current and a flux linkage, nor a current or an angle of each column, as"
+                           " 'I=5A'")
     elif width > 4 or _rows_of_grid(block):
         _bare_matrix(points, block, phase)
     elif width in (3, 4):
@@ -161,6 +167,18 @@ def _add_block(points: Points, block: Block, phase: int) -> None:
     else:
         raise FluxMapError(f"line {block.rows[0].line}: {width} columns: neither a table of angle, current and flux"
                            " linkage nor a matrix")
+
+
+def _numbered(header: Sequence[str]) -> tuple[str, ...]:
+    """A header of columns that differ in a number alone, as psi(2.5) or Flux_5, as one of numbers; empty for another
+    one, and where the numbers may just count the columns."""
+    cells = [re.fullmatch(r"(.*?)[ _(\[]*([+-]?\d+(?:[.,]\d+)?)[\])]*", cell) for cell in header[1:]]
+    if not all(cells) or len({cell[1] for cell in cells if cell}) != 1:
+        return ()
+    texts = [cell[2] for cell in cells if cell]
+    steps = {round(b - a, 9) for a, b in pairwise(number(text) or 0.0 for text in texts)}
+    is_axis = all(step > 0.0 for step in steps) or all(step < 0.0 for step in steps)
+    return (header[0], *texts) if is_axis and steps != {1.0} else ()
 
 
 def _long(points: Points, block: Block, columns: Sequence[Column | None], phase: int) -> None:

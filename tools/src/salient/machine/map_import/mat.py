@@ -4,6 +4,8 @@ length."""
 from __future__ import annotations
 
 import io
+import re
+import struct
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,19 @@ from salient.machine.map_import.layouts import Points, points_of
 from salient.machine.map_import.text import Block, Row
 
 
-def is_mat(data: bytes) -> bool:
-    """Whether a file begins as a MAT file of version 5 or 7.3 does."""
+def is_mat(data: bytes, suffix: str = "") -> bool:
+    """Whether a file begins as a MAT file of version 5 or 7.3 does, or of version 4 with the suffix, as Octave and old
+    versions write it: five numbers, of which the first is its type."""
+    if suffix.lower() == ".mat" and len(data) > 20:
+        kinds = [struct.unpack_from(f"{order}L", data)[0] for order in "<>"]
+        if any(kind <= 4052 and kind // 10 % 10 <= 5 for kind in kinds):
+            return True
     return data[:10] == b"MATLAB 5.0" or is_hdf5(data)
+
+
+def is_octave(text: str) -> bool:
+    """Whether Octave wrote a text, as it does by default."""
+    return text.startswith("# Created by Octave") and "# type: matrix" in text
 
 
 def is_hdf5(data: bytes) -> bool:
@@ -32,7 +44,28 @@ def mat_points(data: bytes) -> Points:
         loaded = loadmat(io.BytesIO(data), squeeze_me=True)
     except Exception as error:  # SciPy raises many kinds for a damaged file
         raise FluxMapError(f"not a MAT file: {' '.join(str(error).split())[:80]}") from None
-    arrays = _arrays({name: value for name, value in loaded.items() if not name.startswith("__")})
+    return _points(_arrays({name: value for name, value in loaded.items() if not name.startswith("__")}))
+
+
+def octave_points(text: str) -> Points:
+    """The points of a text of Octave: matrices by name. FluxMapError."""
+    found: dict[str, np.ndarray] = {}
+    for part in re.split(r"(?m)^# name: ", text)[1:]:
+        name, _, rest = part.partition("\n")
+        sizes = [re.search(rf"(?m)^# {key}: (\d+)$", rest) for key in ("rows", "columns")]
+        rows, columns = (int(size[1]) if size else 0 for size in sizes)
+        try:
+            values = [float(word) for line in rest.splitlines() if not line.startswith("#") for word in line.split()]
+        except ValueError:
+            continue  # of another type
+        if "# type: matrix" in rest and rows * columns == len(values) > 1:
+            found[name.strip()] = np.squeeze(np.array(values).reshape(rows, columns))
+    return _points(found)
+
+
+def _points(arrays: dict[str, np.ndarray]) -> Points:
+    """The points of arrays by name."""
+    arrays = {name: _vector(array) for name, array in arrays.items()}
     found = {name: (column(name), array) for name, array in arrays.items()}
     fluxes = {name: (of, array) for name, (of, array) in found.items() if array.ndim in (2, 3)
               and not (of is not None and of.role == "other")}
@@ -41,11 +74,18 @@ def mat_points(data: bytes) -> Points:
     for flux, array in sorted(fluxes.values(), key=lambda item: order.get(item[0].role if item[0] else "", 2)):
         if (flux is None or flux.role in order) and (axes := _axes(array.shape, vectors)) is not None:
             return _matrix_points(array, flux, axes)
-        if array.ndim == 2 and array.shape[1] in (3, 4) and flux is None:
+        if array.ndim == 2 and array.shape[1] in (3, 4) and (flux is None or len(arrays) == 1):
             return _rows(array)
     points = _columns(found)
     if points is not None:
         return points
+    unnamed = [array for of, array in fluxes.values() if of is None or of.role == "flux"]
+    sides = [array for of, array in vectors.values() if of is None or of.role in ("angle", "current")]
+    if len(unnamed) == 1 and len(sides) == 2 and unnamed[0].ndim == 2:
+        by_size = {len(side): side for side in sides}
+        rows, columns = (by_size.get(size) for size in unnamed[0].shape)
+        if rows is not None and columns is not None and len(by_size) == 2:
+            return _rows(np.block([[np.zeros((1, 1)), columns[None]], [rows[:, None], unnamed[0]]]))
     named = ", ".join(f"{name} {'x'.join(map(str, array.shape))}" for name, array in arrays.items())
     raise FluxMapError(f"no matrix of flux linkages with vectors of its angles and currents; it has {named:.200}")
 
@@ -63,6 +103,17 @@ def _arrays(values: dict[str, Any]) -> dict[str, np.ndarray]:
         elif array.dtype.kind in "fiu":
             found[name] = array.astype(float)
     return found
+
+
+def _vector(array: np.ndarray) -> np.ndarray:
+    """A mesh grid, which repeats one row or column, as that; another array as it is."""
+    if array.ndim != 2 or 1 in array.shape:
+        return array
+    row: np.ndarray = array[0]
+    column_of: np.ndarray = array[:, 0]
+    if np.all(array == row):
+        return row
+    return column_of if np.all(array == column_of[:, None]) else array
 
 
 def _axes(shape: tuple[int, ...], vectors: dict[str, tuple[Column | None, np.ndarray]]) -> tuple[Axis, Axis] | None:

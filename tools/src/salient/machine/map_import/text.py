@@ -10,6 +10,10 @@ from dataclasses import dataclass, field
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MISSING = {"", "nan", "-", "--", "n/a", "na", "null"}
+_GROUPED = {",": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?"), ".": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")}
+_DECIMAL = {",": re.compile(r"[+-]?\d*,\d+([eEdD].*)?"), ".": re.compile(r"[+-]?\d*\.\d+([eEdD].*)?")}
+_NOTE = re.compile(r"\s+(#|%|!|//)\s.*")
+_AXIS_MIN = 3  # cells with digits of a header that a line of units below it does not replace
 _SEPARATORS = (";", "\t", ",", None)
 """None: blanks. The first of those that split equally many lines into numbers is used."""
 
@@ -56,7 +60,9 @@ def number(cell: str) -> float | None:
 def blocks(text: str) -> list[Block]:
     """The blocks of a text. A line of text after numbers begins a new one, and so does a blank line."""
     lines = [re.sub(r"^\s*-->\s*", "", line) for line in text.splitlines()]  # FEMM's console
+    lines = [_without_note(line) for line in lines]
     separator = max(_SEPARATORS, key=lambda by: sum(_is_numbers(_cells(line, by)) for line in lines))
+    grouping = _grouping(lines, separator)
     found = [Block()]
     for number_of, line in enumerate(lines, start=1):
         stripped = line.strip()
@@ -66,9 +72,9 @@ def blocks(text: str) -> list[Block]:
                 found.append(Block())
             if comment:
                 rest = stripped[comment.end():].strip()
-                _head(found[-1], rest, _cells(rest, separator), comment=True)
+                _head(found[-1], rest, _ungrouped(_cells(rest, separator), grouping), comment=True)
             continue
-        cells = _cells(line, separator)
+        cells = _ungrouped(_cells(line, separator), grouping)
         if _is_numbers(cells):
             found[-1].rows.append(Row(number_of, tuple(cells), tuple(number(cell) or 0.0 for cell in cells)))
             continue
@@ -78,8 +84,30 @@ def blocks(text: str) -> list[Block]:
     return [block for block in found if block.rows]
 
 
+def _without_note(line: str) -> str:
+    """A row of numbers without a remark behind it."""
+    short = _NOTE.sub("", line)
+    return short if short != line and any(_is_numbers(_cells(short, by)) for by in _SEPARATORS) else line
+
+
+def _grouping(lines: Sequence[str], separator: str | None) -> str:
+    """The sign that groups the thousands of numbers, where others show that it is not the decimal sign; else empty."""
+    cells = [cell for line in lines for cell in _cells(line, separator)]
+    decimal = [sign for sign, pattern in _DECIMAL.items()
+               if any(pattern.fullmatch(cell) and not _GROUPED[sign].fullmatch(cell) for cell in cells)]
+    return {",": ".", ".": ","}[decimal[0]] if len(decimal) == 1 else ""
+
+
+def _ungrouped(cells: list[str], grouping: str) -> list[str]:
+    if not grouping:
+        return cells
+    return [cell.replace(grouping, "") if _GROUPED[grouping].fullmatch(cell) else cell for cell in cells]
+
+
 def _head(block: Block, line: str, cells: Sequence[str], *, comment: bool) -> None:
-    if sum(1 for cell in cells if cell) > 1 and not (comment and block.header):
+    is_axis = sum(bool(re.search(r"\d", cell)) for cell in block.header) >= _AXIS_MIN
+    is_units = is_axis and not re.search(r"\d", line)
+    if sum(1 for cell in cells if cell) > 1 and not is_units and not (comment and block.header):
         block.header = tuple(cells)
     block.titles.append(line)
 

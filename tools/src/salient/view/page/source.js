@@ -74,6 +74,7 @@
 //     id: number;              // as Batch.id
 //     name: string; node: string; length: number; comment: string;   // node: the sender
 //     may_be_longer?: boolean; // frames of this length or more count, else of this one
+//     group?: number;          // parameter group of J1939, from any source; else frames of `id` count
 //     signals: Signal[];
 // }
 //

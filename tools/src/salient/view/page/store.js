@@ -110,6 +110,8 @@ export class Store {
         this.last_ns = NaN;
         this.byId = new Map(messages.map((message) => [message.id, { message, raw: new Series(2, keep), count: 0,
                                                                      watched: [] }]));
+        this.byGroup = new Map(messages.filter((message) => message.group !== undefined)
+            .map((message) => [message.group, this.byId.get(message.id)]));
         this.byName = new Map([...this.byId.values()].map((entry) => [entry.message.name, entry]));
         this.series = new Map();
         this.status = this.byName.get("DRIVE_STATUS");
@@ -143,6 +145,12 @@ export class Store {
         return entry ? entry.count : 0;
     }
 
+    /** The entry of a J1939 message by its parameter group, as FrameKeys of salient.bus.signals. */
+    ofGroup(id) {
+        return this.byGroup.size === 0 || id < 0x80000000 ? undefined
+            : this.byGroup.get(id & ((id >>> 16 & 0xff) >= 240 ? 0x03ffff00 : 0x03ff0000));
+    }
+
     /** Takes a batch of a source. */
     add(batch) {
         if (batch.rewound && batch.count) {
@@ -154,7 +162,7 @@ export class Store {
         this.lost += batch.lost;
         this.frames += batch.count;
         for (let i = 0; i < batch.count; i++) {
-            const entry = this.byId.get(batch.id[i]);
+            const entry = this.byId.get(batch.id[i]) ?? this.ofGroup(batch.id[i]);
             const low = words[2 * i];
             const high = words[2 * i + 1];
             const arrived_ns = batch.time_ns[i];
