@@ -361,6 +361,7 @@ TEST_F(Drive, has_one_of_eight_nodes_and_no_other) {
     }
 }
 
+// [SR-03]
 TEST_F(Drive, lines_of_the_torque_off_that_differ_for_200_ms_are_a_failed_check_and_before_they_are_none) {
     periods(100);
     hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_STO_2;
@@ -393,6 +394,7 @@ TEST_F(Drive,
     }
 }
 
+// [SR-47]
 TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everything_advances) {
     EXPECT_EQ(hal.watchdog_starts, 1u);
     periods(4000); // 100 ms
@@ -400,6 +402,7 @@ TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everythin
     EXPECT_LE(hal.kicks, 100u);
 }
 
+// [SR-47]
 TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
     const std::vector<std::function<void()>> without = {
         // Background, deferred interrupt, control interrupt.
@@ -421,6 +424,7 @@ TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
     }
 }
 
+// [SR-48]
 TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_cleared_and_armed) {
     hal.reset_cause = HAL_RESET_WATCHDOG;
     SetUp();
@@ -445,6 +449,7 @@ TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_clear
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
 }
 
+// [SR-53]
 TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
     const std::array<uint32_t, 3> program{1, 2, 3};
     hal_t changed;
@@ -467,6 +472,7 @@ TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
     EXPECT_TRUE(changed.open);
 }
 
+// [SR-18]
 TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
     hal.temperature_code[HAL_ADC_INVERTER + 1] = 65520;
     periods(100);
@@ -477,6 +483,7 @@ TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+// [SR-58]
 TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_background) {
     drive.store.inhibited = true;
     periods(100);
@@ -487,6 +494,7 @@ TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_b
     EXPECT_TRUE(hal.open);
 }
 
+// [SR-51]
 TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     command(COMMAND_RUN);
@@ -506,6 +514,7 @@ TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
 }
 
+// [SR-50]
 TEST_F(Drive, a_changed_constant_of_the_heat_is_a_failed_check_within_2_ms) {
     uint32_t *const words[] = {&drive.control_parameters.thermal.winding.inverse_q48,
                                &drive.control_parameters.thermal.switches.rate_q48,
@@ -524,6 +533,7 @@ TEST_F(Drive, a_changed_constant_of_the_heat_is_a_failed_check_within_2_ms) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, of_a_run_that_a_changed_state_ends_the_next_background_leaves_neither_duties_nor_a_torque) {
     periods(100);
     command(COMMAND_RUN);
@@ -565,6 +575,7 @@ TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+// [SR-51]
 TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     send(COMMAND_OFF);
@@ -650,6 +661,7 @@ TEST_F(Drive, a_flipped_bit_of_an_index_leads_nowhere_outside_of_its_array) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
     periods(100);
     command(COMMAND_RUN);
@@ -667,6 +679,7 @@ TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, a_state_that_is_none_is_the_fault_memory) {
     periods(100);
     ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
@@ -688,6 +701,7 @@ TEST_F(Drive, a_control_rate_that_has_changed_in_memory_gives_no_constants) {
     EXPECT_EQ(drive.self_test.failed & SELF_TEST_PARAMETERS, SELF_TEST_PARAMETERS);
 }
 
+// [SR-51]
 TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     periods(100);
     command(COMMAND_RUN);
@@ -699,6 +713,7 @@ TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     EXPECT_TRUE(hal.open);
 }
 
+// [SR-51] [SR-52]
 TEST_F(Drive, a_bit_of_a_run_s_request_or_arming_that_flips_does_not_end_the_run_without_a_fault) {
     periods(100);
     command(COMMAND_RUN);
@@ -747,6 +762,7 @@ TEST_F(Drive, an_angle_beyond_what_is_learned_is_the_fault_memory) {
     }
 }
 
+// [SR-05]
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);
     command(COMMAND_RUN);
@@ -762,6 +778,7 @@ TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     EXPECT_EQ(drive.command.request, COMMAND_OFF);
 }
 
+// [SR-04]
 TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_and_comes_back_with_them) {
     for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
         SetUp();
@@ -801,6 +818,7 @@ TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_a
     }
 }
 
+// [SR-04]
 TEST_F(Drive, a_second_ramp_to_zero_begins_at_the_torque_of_its_time) {
     periods(100);
     command(COMMAND_RUN, 1000.0);
@@ -813,6 +831,7 @@ TEST_F(Drive, a_second_ramp_to_zero_begins_at_the_torque_of_its_time) {
     }
 }
 
+// [SR-05]
 TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     periods(100);
     command(COMMAND_RUN);
@@ -830,6 +849,7 @@ TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
 }
 
+// [SR-34]
 TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
     periods(100);
     command(COMMAND_RUN);
@@ -851,6 +871,7 @@ TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
 }
 
+// [SR-33]
 TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     periods(100);
     command(COMMAND_RUN);
@@ -966,6 +987,7 @@ TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_
     }
 }
 
+// [SR-46]
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -976,6 +998,7 @@ TEST_F(Drive, lost_interrupts_reach_the_protection) {
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
 }
 
+// [SR-02] [SR-12] [SR-45]
 TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
     const struct {
         uint32_t cause;
@@ -1008,7 +1031,7 @@ TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
     }
 }
 
-// With coarse counts 16 bits of the angle show where in its count it is.
+// With coarse counts 16 bits of the angle show where in its count it is. [SR-40]
 TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_period_of_the_fault) {
     hal.encoder_bits = 10;
     hal.encoder_counts = 300;
@@ -1027,6 +1050,7 @@ TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_pe
     EXPECT_EQ(fault_trace_period(&drive.trace, FAULT_TRACE_PERIODS), nullptr);
 }
 
+// [SR-46]
 TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     const auto late = [this](int count) {
         for (int k = 0; k < count; k++) {
@@ -1050,6 +1074,7 @@ TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     EXPECT_EQ(drive.control.protection.late_interrupts, 5u);
 }
 
+// [SR-46]
 TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a_fault) {
     periods(100);
     command(COMMAND_RUN);
@@ -1128,6 +1153,7 @@ TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_
     EXPECT_EQ(deferred.skipped_periods, 2);
 }
 
+// [SR-46]
 TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
     periods(100);
     command(COMMAND_RUN);
@@ -1154,6 +1180,7 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
 }
 
+// [SR-56]
 TEST_F(Drive, five_unprotected_frames_change_nothing) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1198,6 +1225,7 @@ TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
     EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1215,7 +1243,7 @@ TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     EXPECT_FALSE(drive.comms.commands.arming.configuring);
 }
 
-// A set copies, applies and stores only values that have not changed in memory since they were set.
+// A set copies, applies and stores only values that have not changed in memory since they were set. [SR-57]
 TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into_effect_nor_stored) {
     periods(100);
     const int32_t trip_q9 = drive.control_parameters.protection.current_trip_q9;
@@ -1243,6 +1271,7 @@ TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into
     EXPECT_EQ(drive.store.parameters.sequence, 0u);
 }
 
+// [SR-57]
 TEST_F(Drive, a_staged_value_that_changed_in_memory_is_not_applied) {
     periods(100);
     auto set = frames::parameter_set(arm_for_configuration(), {{PARAMETER_TORQUE_MAX_NM, 5 << 24}});
@@ -1259,6 +1288,7 @@ TEST_F(Drive, a_staged_value_that_changed_in_memory_is_not_applied) {
     EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
 }
 
+// [SR-56]
 TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
     periods(100);
     std::vector<hal_can_frame_t> recording{frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION)};
@@ -1282,6 +1312,7 @@ TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
     EXPECT_GE(drive.comms.commands.arming.refused, 4 * 4);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1341,6 +1372,7 @@ TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) 
     EXPECT_EQ(std::memcmp(before.values, drive.parameters.values, sizeof before.values), 0);
 }
 
+// [SR-56]
 TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1410,6 +1442,7 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     EXPECT_EQ(set({{PARAMETER_OVER_VOLTAGE_V, 300 << 6}}).status, PARAMETER_STATUS_DONE);
 }
 
+// [SR-56]
 TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_seconds) {
     periods(100);
     const auto armed = [this] { return drive.comms.commands.arming.configuring; };
@@ -1456,7 +1489,7 @@ TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_se
     arm(); // for tunable parameters
 }
 
-// A rotor at 9.6 rad/s, which a stop ramps down.
+// A rotor at 9.6 rad/s, which a stop ramps down. [SR-56]
 TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
     const auto turn = [this](int count) {
         for (int k = 0; k < count; k++) {
@@ -1493,7 +1526,7 @@ TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
     }
 }
 
-// The control parameters always belong to the whole set, though a run takes over parts of them only.
+// The control parameters always belong to the whole set, though a run takes over parts of them only. [SR-56]
 TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     periods(100);
     command(COMMAND_RUN);
@@ -1525,6 +1558,7 @@ TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     EXPECT_EQ(drive.control.deferred.speed_smc.delta_q27, drive.control_parameters.speed_smc.delta_q27);
 }
 
+// [SR-56]
 TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_changed_in_run) {
     periods(100);
     // Armed for a run by commands other than run.
@@ -1565,6 +1599,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
 }
 
 // Frames of sets in any order, lost, damaged, recorded, with runs between: a model of the host says what may change.
+// [SR-56]
 TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_armed_host) {
     periods(100);
     std::mt19937 random(16);
@@ -1723,6 +1758,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     EXPECT_GT(*std::max_element(most_counts, most_counts + 3), 200u);
 }
 
+// [SR-09]
 TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_limits_it) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         const drive_config_t config = {.control_rate_hz = 40000, .controller = controller};
@@ -1798,6 +1834,7 @@ TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
 }
 #endif
 
+// [SR-09]
 TEST_F(Drive, telemetry_names_the_lost_phase_s_limit_of_the_available_torque_whichever_is_lost) {
     for (const uint32_t lost : {1u, 2u, 4u}) {
         drive.degraded.lost = lost;
@@ -1830,6 +1867,7 @@ TEST_F(Drive, the_scale_of_the_tables_that_has_been_found_takes_effect_in_the_in
     }
 }
 
+// [SR-60]
 TEST_F(Drive, a_logged_fault_names_the_phases_that_have_had_one) {
     periods(100);
     drive.flux.phases = 4u;
@@ -1873,6 +1911,7 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
 }
 
+// [SR-35]
 TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_round) {
     hal.adc.bus_voltage_counts = 0; // the link is off: the drive stays in its initial state
     command(COMMAND_OFF);
@@ -1891,7 +1930,7 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     EXPECT_EQ(hal.writes, 0u);
 }
 
-// Bus-off: the error counter is above 255 until the controller has rejoined.
+// Bus-off: the error counter is above 255 until the controller has rejoined. [SR-38]
 TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_error_free_second_resets) {
     const auto wait_us = [this] {
         hal.can_status = {.state = HAL_CAN_BUS_OFF, .transmit_errors = 256, .receive_errors = 0};
@@ -1922,7 +1961,7 @@ TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_e
     EXPECT_EQ(state.bus_state, BUS_STATE_ERROR_ACTIVE);
 }
 
-// The controller has gone off the bus again before the drive has seen that it had rejoined.
+// The controller has gone off the bus again before the drive has seen that it had rejoined. [SR-38]
 TEST_F(Drive, requests_to_rejoin_again_when_bus_off_has_not_ended) {
     hal.can_status.state = HAL_CAN_BUS_OFF;
     periods(440); // 11 ms
@@ -1935,6 +1974,7 @@ TEST_F(Drive, requests_to_rejoin_again_when_bus_off_has_not_ended) {
     EXPECT_EQ(hal.rejoins, 7u); // 40, 80, 160, 320, 320 ms later
 }
 
+// [SR-38]
 TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn) {
     periods(100);
     command(COMMAND_RUN, 0);
@@ -1976,6 +2016,7 @@ TEST_F(Drive, error_counters_are_reported) {
     EXPECT_EQ(hal.rejoins, 0u);
 }
 
+// [SR-37]
 TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault_until_a_second_without) {
     periods(100);
     command(COMMAND_RUN);
@@ -2001,6 +2042,7 @@ TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault
     EXPECT_EQ(clear(), DRIVE_STATE_READY);
 }
 
+// [SR-37]
 TEST_F(Drive, no_other_identifier_length_or_flag_is_an_identifier_conflict_or_changes_the_state) {
     const std::vector<uint32_t> for_drive = {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID,
                                              DRIVE_PARAMETER_REQUEST_FRAME_ID};

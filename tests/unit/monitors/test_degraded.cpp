@@ -1,4 +1,4 @@
-// Degraded running: which loss of a phase is accepted, and the torque that remains. Machine: saturating.
+// Degraded running: which loss of a phase is accepted, and the torque that remains. Machine: saturating. [SR-31]
 #include <cmath>
 #include <cstdint>
 

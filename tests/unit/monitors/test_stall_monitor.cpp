@@ -1,3 +1,4 @@
+// [SR-24]
 #include <cmath>
 
 #include <gtest/gtest.h>
