@@ -762,6 +762,203 @@ TEST_F(Drive, an_angle_beyond_what_is_learned_is_the_fault_memory) {
     }
 }
 
+// [SR-07]
+TEST_F(Drive, counts_faster_than_the_limit_are_over_speed_within_a_millisecond_in_either_direction) {
+    for (const int direction : {1, -1}) {
+        SetUp();
+        periods(100);
+        double counts = hal.encoder_counts;
+        const auto turn = [&](double part) {
+            counts += direction * part * drive.parameters.values[PARAMETER_OVER_SPEED_RPM] / 60.0 * 25e-6 * 131072.0;
+            hal.encoder_counts = uint32_t(int64_t(std::floor(counts))) & 131071u;
+            periods(1);
+        };
+        for (int k = 0; k < 8000; k++) {
+            turn(0.95 * std::min(k / 4000.0, 1.0));
+        }
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY) << direction;
+        int until = 0;
+        while (until < 400 && drive.control.state_machine.state == DRIVE_STATE_READY) {
+            turn(1.15);
+            until++;
+        }
+        EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_OVER_SPEED) << direction;
+        EXPECT_LE(until, 44) << "1 ms, and the period of the background's check";
+        EXPECT_GE(until, 4);
+    }
+}
+
+// A phase without current while there is voltage. [SR-31]
+TEST_F(Drive, a_lost_phase_is_switched_off_where_that_is_allowed_until_a_fault_is_cleared_outside_of_the_run) {
+    for (const bool allowed : {false, true}) {
+        SetUp();
+        counter = 0;
+        hal.adc.phase_current_counts[0] = hal.adc.phase_current_counts[1] = hal.adc.phase_current_counts[2] = 0;
+        std::fill(std::begin(flux_Wb), std::end(flux_Wb), 0.0);
+        parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, allowed ? 1 : 0);
+        drive.parameters.revision++;
+        periods(100);
+        command(COMMAND_RUN);
+        int lost = -1;
+        for (int k = 0; k < 40 && lost < 0 && drive.control.state_machine.state != DRIVE_STATE_FAULT; k++) {
+            periods(1);
+            for (int phase = 0; phase < 3; phase++) { // the first phase that is switched on is open
+                if (lost < 0 && !hal.open && hal.written.upper[phase] + hal.written.lower[phase] > 2600) {
+                    lost = phase;
+                }
+            }
+        }
+        ASSERT_GE(lost, 0);
+        for (int k = 0; k < 40 && drive.control.state_machine.state == DRIVE_STATE_RUN && drive.degraded.lost == 0;
+             k++) {
+            hal.adc.phase_current_counts[lost] = 0;
+            flux_Wb[lost] = 0.0;
+            periods(1);
+        }
+        if (!allowed) {
+            EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_PHASE_OPEN);
+            EXPECT_EQ(drive.control.lost_phase, 0u);
+            continue;
+        }
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        EXPECT_EQ(drive.degraded.lost, 1u << lost);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u);
+        periods(4);
+        EXPECT_LE(hal.written.upper[lost] + hal.written.lower[lost], 0) << "its switches stay open";
+        send(COMMAND_CLEAR_FAULT); // refused in a run
+        periods(4);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u);
+        send(COMMAND_OFF);
+        periods(4);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u) << "the end of the run gives nothing back";
+        send(COMMAND_CLEAR_FAULT);
+        periods(8);
+        EXPECT_EQ(drive.control.lost_phase, 0u);
+        EXPECT_EQ(drive.degraded.lost, 0u);
+    }
+}
+
+TEST_F(Drive, a_position_command_reaches_the_interrupt_with_the_parameter_s_homing_and_telemetry_has_its_state) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    hal.to_drive.push_back(frames::position_command(++counter, COMMAND_RUN, POSITION_ORDER_PROFILE, 1 << 16));
+    arm_for_run(7);
+    periods(4);
+    hal.to_drive.push_back(frames::position_command(++counter, COMMAND_RUN, POSITION_ORDER_PROFILE, 1 << 16));
+    periods(4);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(drive.control.position_command.set_point.order, POSITION_ORDER_PROFILE);
+    EXPECT_EQ(drive.control.position_command.set_point.target, POSITION_ONE_REV / 4);
+    EXPECT_EQ(int(drive.control.position_command.set_point.homing), drive.parameters.values[PARAMETER_HOMING_METHOD]);
+    EXPECT_TRUE(drive.control.position.status.active);
+    const auto state = [this] {
+        drive_telemetry_t values{};
+        telemetry_collect(&drive, &hal, hal.time_us, &values);
+        EXPECT_EQ(values.status.mode, DRIVE_MODE_POSITION);
+        return drive_position_state_t(values.position.position_state);
+    };
+    position_status_t *status = &drive.control.position.status;
+    for (const auto &[set, expected] : std::vector<std::pair<position_status_t, drive_position_state_t>>{
+             {{.reference_ended = false}, DRIVE_POSITION_STATE_MOVING},
+             {{.reference_ended = true}, DRIVE_POSITION_STATE_ARRIVED},
+             {{.in_position = true, .reference_ended = true}, DRIVE_POSITION_STATE_IN_POSITION},
+             {{.homing = true, .in_position = true}, DRIVE_POSITION_STATE_HOMING},
+             {{.homing = true, .following_error = true}, DRIVE_POSITION_STATE_FOLLOWING_ERROR}}) {
+        *status = set;
+        status->active = true;
+        EXPECT_EQ(state(), expected);
+    }
+}
+
+TEST_F(Drive, an_experiment_drives_its_phase_and_is_over_with_its_limit_or_without_commands) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    const auto experiment = [this](uint8_t number) {
+        hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_PULSE, 1, number));
+    };
+    experiment(1);
+    arm_for_run(7);
+    periods(2);
+    experiment(2); // another number begins
+    int most[3] = {};
+    for (int k = 0; k < 40; k++) {
+        periods(1);
+        for (unsigned phase = 0; phase < 3; phase++) {
+            most[phase] = std::max(most[phase], int(hal.adc.phase_current_counts[phase]));
+        }
+    }
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_TRUE(drive.control.state_machine.identifies);
+    EXPECT_FALSE(hal.open);
+    EXPECT_GT(most[1], 0);
+    EXPECT_EQ(most[0] + most[2], 0);
+    // Commands that are overdue end it at once: there is no torque to ramp.
+    hal.adc.phase_current_counts[1] = 0;
+    periods(int(51000 - (hal.time_us - drive.command.time_us)) / 25);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE);
+    EXPECT_TRUE(hal.open);
+}
+
+TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config)); // experiments are the controller salient's
+    periods(100);
+    hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_HOLD, 1));
+    arm_for_run(7);
+    periods(2);
+    hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_HOLD, 1));
+    periods(4);
+    EXPECT_EQ(drive.identify.state, IDENTIFY_ENDED);
+    EXPECT_EQ(drive.identify.limit, IDENTIFY_CONTROLLER);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(hal.open);
+}
+
+// Torque that would carry the speed beyond the last reference is none; towards the reference, and of torque mode, it
+// ramps. [SR-04]
+TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_in_either_direction) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const drive_t running = drive;
+    const uint32_t time_us = hal.time_us;
+    const double rad_s = 2.0 * 3.14159265358979 / 60.0 * 4194304.0;
+    for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
+        for (const int direction : {1, -1}) {
+            for (const double speed_rpm : {500.0, 630.0, 645.0}) {
+                drive = running;
+                drive.command.mode = mode;
+                drive.command.speed_reference_q22 = int32_t(direction * 600.0 * rad_s);
+                drive.control.observer.speed_q22 = int32_t(direction * speed_rpm * rad_s);
+                drive.control.torque_reference_q24 = direction * (4 << 24);
+                hal.time_us = drive.command.time_us + 60000;
+                drive_background(&drive, &hal);
+                const bool beyond = mode == DRIVE_MODE_SPEED && speed_rpm > 640.0; // by a sixteenth
+                EXPECT_NEAR(drive.command.torque_reference_q24 / 16777216.0, beyond ? 0.0 : direction * 3.6, 0.01)
+                    << mode << direction << speed_rpm;
+            }
+        }
+    }
+    hal.time_us = time_us;
+}
+
+TEST_F(Drive, has_the_period_of_telemetry_of_its_configuration_and_else_the_parameter_s) {
+    const int32_t usual = drive.parameters.values[PARAMETER_TELEMETRY_PERIOD_MS];
+    drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    config.telemetry_period_ms = uint32_t(usual) + 7u;
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.parameters.values[PARAMETER_TELEMETRY_PERIOD_MS], usual + 7);
+}
+
 // [SR-05]
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);

@@ -95,6 +95,36 @@ TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
     }
 }
 
+TEST_F(Commands, a_position_command_has_its_order_and_target_and_each_is_a_new_one) {
+    const uint32_t before = command.position.sequence;
+    ASSERT_EQ(receive(frames::position_command(1, COMMAND_STOP, POSITION_ORDER_HALT, -(3 << 18))), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_STOP);
+    EXPECT_EQ(command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+    EXPECT_EQ(command.position.target, -3 * POSITION_ONE_REV);
+    EXPECT_EQ(command.position.homing, POSITION_HOMING_METHODS) << "the parameter's";
+    EXPECT_EQ(command.position.sequence, before + 1);
+    ASSERT_EQ(receive(frames::position_command(2, COMMAND_STOP, POSITION_ORDER_HALT, -(3 << 18))), COMMANDS_COMMAND);
+    EXPECT_EQ(command.position.sequence, before + 2) << "an equal target is one more";
+}
+
+TEST_F(Commands, a_position_command_beyond_the_last_request_or_order_is_rejected) {
+    expect_rejected(frames::position_command(1, COMMAND_CLEAR_FAULT + 1, POSITION_ORDER_HALT, 0),
+                    &commands.counters.out_of_range);
+    expect_rejected(frames::position_command(2, COMMAND_OFF, POSITION_ORDER_HALT + 1, 0),
+                    &commands.counters.out_of_range);
+}
+
+// [SR-34]
+TEST_F(Commands, a_request_to_arm_of_an_armed_drive_is_refused_and_leaves_it_armed) {
+    arm(1, 10000);
+    const uint32_t challenge = commands.arming.challenge;
+    EXPECT_EQ(take(frames::arm(9, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 11000), COMMANDS_REJECTED);
+    EXPECT_TRUE(commands.arming.armed);
+    EXPECT_EQ(commands.arming.challenge, challenge) << "none is drawn";
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE);
+}
+
 // [SR-34]
 TEST_F(Commands, an_experiment_needs_arming_and_has_its_window) {
     ASSERT_EQ(receive(frames::identify_window(1, 0x1234, 0x56)), COMMANDS_COMMAND);
