@@ -951,6 +951,53 @@ TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_
     hal.time_us = time_us;
 }
 
+// Boot-up, heartbeat and SDO instead of the frames of drive.dbc, whose commands have no effect. [SR-38]
+TEST_F(Drive, as_a_node_of_canopen_it_speaks_that_protocol_alone_and_is_enabled_by_its_state_machine_alone) {
+    drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    config.canopen_node = 5;
+    hal.from_drive.clear();
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    const auto receive = [this](uint32_t identifier, const std::vector<uint8_t> &data) {
+        hal_can_frame_t frame{};
+        frame.identifier = identifier;
+        frame.length = uint8_t(data.size());
+        std::copy(data.begin(), data.end(), frame.data);
+        hal.to_drive.push_back(frame);
+        periods(44);
+    };
+    const auto sent = [this](uint32_t identifier) {
+        return std::count_if(hal.from_drive.begin(), hal.from_drive.end(),
+                             [&](const hal_can_frame_t &frame) { return frame.identifier == identifier; });
+    };
+    const auto control = [&](uint8_t word) { receive(0x605, {0x2B, 0x40, 0x60, 0, word, 0, 0, 0}); };
+    periods(400);
+    EXPECT_EQ(sent(0x705), 1) << "boot-up";
+    command(COMMAND_RUN);
+    periods(44);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.comms.commands.counters.accepted, 0);
+    receive(0, {1, 5});
+    receive(0x605, {0x2F, 0x60, 0x60, 0, 1, 0, 0, 0}); // profile position
+    control(6);
+    control(7);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    control(15);
+    periods(44);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(int(drive.control.position_command.set_point.homing), drive.parameters.values[PARAMETER_HOMING_METHOD]);
+    EXPECT_EQ(drive.comms.canopen.place.position, drive.control.position.status.position);
+    EXPECT_GE(sent(0x585), 4) << "answers of SDO";
+    EXPECT_EQ(sent(DRIVE_STATUS_FRAME_ID), 0);
+    hal.can_status.state = HAL_CAN_BUS_OFF;
+    periods(4);
+    EXPECT_FALSE(drive.comms.bus.run_inhibited) << "what was enabled has to be enabled anew";
+    hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
+    periods(4000);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE);
+}
+
 TEST_F(Drive, has_the_period_of_telemetry_of_its_configuration_and_else_the_parameter_s) {
     const int32_t usual = drive.parameters.values[PARAMETER_TELEMETRY_PERIOD_MS];
     drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};

@@ -325,6 +325,33 @@ TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_fro
     }
 }
 
+// A sensor that fails for a sample: its current moves, the integral of the voltage does not. [SR-22] [SR-30]
+TEST_F(AngleEvidence, a_current_that_moves_without_a_voltage_is_no_evidence_until_the_phase_was_without_current) {
+    for (const bool fails : {true, false}) {
+        monitor = {};
+        input.zero_at[0] = input.period;
+        const auto contradicted = [&](bool wrong) {
+            for (int k = 0; k < (wrong ? 240 : 20); k++) {
+                step(wrong ? 77.0 : 65.0, 65.0, 25.0);
+            }
+            return (monitor.evidence.contradicts & 1u) != 0;
+        };
+        EXPECT_FALSE(contradicted(false));
+        if (fails) {
+            const int32_t flux_q29 = input.flux_q29[0];
+            step(65.0, 65.0, 8.0);
+            flux_offset_q29 = flux_q29 - input.flux_q29[0];
+            step(65.0, 65.0, 8.0);
+            flux_offset_q29 = 0;
+            step(65.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(contradicted(true), !fails);
+        monitor.state.phase[0].shown = false;
+        input.zero_at[0] = input.period;
+        EXPECT_TRUE(contradicted(true)) << fails;
+    }
+}
+
 // [SR-22] [SR-30]
 TEST_F(AngleEvidence, flux_linkage_that_a_warm_or_a_cold_winding_explains_does_not_contradict_the_angle) {
     const struct {
