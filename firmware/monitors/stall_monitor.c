@@ -69,7 +69,7 @@ COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *in
     const int32_t speed_q22 = forward ? input->speed_q22 : fixed_subtract(0, input->speed_q22);
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
     const bool before = monitor->vain && monitor->forward == forward;
-    if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
+    if (speed_q22 < 0) {
         monitor->backwards_us = time_us;
     } else if (time_us - monitor->backwards_us > STALL_TIME_US) {
         monitor->backwards_us = time_us - STALL_TIME_US - 1u; /* its age does not wrap */

@@ -238,6 +238,14 @@ TEST_F(StateMachine, a_command_timeout_is_a_fault_in_run_only) {
 }
 
 // [SR-40]
+TEST(StateMachineTable, the_first_fault_of_a_mask_is_the_lowest_bit_of_all_64) {
+    EXPECT_EQ(state_machine_first_fault(0), FAULT_NONE);
+    for (unsigned bit = 0; bit < 64; bit++) {
+        EXPECT_EQ(unsigned(state_machine_first_fault(UINT64_MAX << bit)), bit);
+    }
+}
+
+// [SR-40]
 TEST_F(StateMachine, the_record_keeps_the_first_fault) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_ENCODER));

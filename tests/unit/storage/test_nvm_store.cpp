@@ -458,4 +458,36 @@ TEST_F(NvmStore, the_time_of_a_fault_counts_the_wraps_of_the_clock) {
     EXPECT_EQ(drive.store.waiting[1].time_wraps, 2);
 }
 
+// [SR-60]
+TEST_F(NvmStore, a_fault_of_before_the_last_step_has_not_wrapped_and_the_wraps_end_at_their_largest_number) {
+    nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 5000, false);
+    fault_record_t record = fault_of(1);
+    record.time_us = 4000;
+    nvm_store_follow_fault(&drive.store, &record);
+    EXPECT_EQ(drive.store.waiting[0].time_us, 4000u);
+    EXPECT_EQ(drive.store.waiting[0].time_wraps, 0);
+    drive.store.time_wraps = UINT16_MAX - 1; // some 9 years
+    for (int wrap = 0; wrap < 3; wrap++) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 10, false);
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 10, false);
+        EXPECT_EQ(drive.store.time_wraps, UINT16_MAX);
+    }
+}
+
+// [SR-60]
+TEST_F(NvmStore, a_logged_fault_that_has_changed_in_the_memory_is_not_read_and_the_others_are) {
+    for (int k = 0; k < 3; k++) {
+        write(WRITE_FAULT);
+    }
+    uint64_t *words = memory.hal.nvm.word[FAULT_PAGE];
+    const uint64_t before = words[FAULT_WORDS + 1]; // of the second record
+    words[FAULT_WORDS + 1] ^= UINT64_C(1) << 17;
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 1));
+    nvm_store_fault_t read{};
+    EXPECT_FALSE(nvm_store_read_fault(&drive.store, &memory.hal, 2, &read));
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 3));
+    words[FAULT_WORDS + 1] = before;
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 2));
+}
+
 } // namespace
