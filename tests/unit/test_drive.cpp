@@ -494,6 +494,57 @@ TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_b
     EXPECT_TRUE(hal.open);
 }
 
+// [SR-58]
+TEST_F(Drive, a_stored_set_that_is_damaged_keeps_it_from_starting_before_the_first_background) {
+    parameter_store_save(&drive.store);
+    periods(400);
+    ASSERT_EQ(nvm_read(&hal.nvm, 0, 0) != UINT64_MAX, true) << "stored";
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.control.reported_fault_mask, 0u);
+    hal.nvm.word[0][4] ^= 1;
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.control.reported_fault_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+    for (int k = 0; k < 100; k++) { // interrupts alone
+        hal.time_us += 25;
+        drive_control_interrupt(&drive, &hal);
+        deferred_interrupt(&drive, &hal);
+    }
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_INITIALISE);
+    EXPECT_EQ(drive.control.state_machine.start_inhibit_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+}
+
+// The ramp of overdue commands runs after a request to stop, and the request before a bus-off ages.
+// [SR-51]
+TEST_F(Drive, a_request_in_effect_may_differ_from_the_received_one_in_the_ramp_after_a_stop_and_after_bus_off_alone) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    const drive_t running = drive;
+    const hal_t before = hal;
+    const struct {
+        bool ramping, inhibited;
+        command_request_t in_effect, received;
+        bool intact;
+    } cases[] = {
+        {false, false, COMMAND_RUN, COMMAND_RUN, true},   {true, false, COMMAND_RUN, COMMAND_STOP, true},
+        {false, false, COMMAND_RUN, COMMAND_STOP, false}, {true, false, COMMAND_STOP, COMMAND_RUN, false},
+        {true, false, COMMAND_RUN, COMMAND_OFF, false},   {true, false, COMMAND_OFF, COMMAND_STOP, false},
+        {false, true, COMMAND_RUN, COMMAND_OFF, true},
+    };
+    for (const auto &one : cases) {
+        drive = running;
+        hal = before;
+        drive.ramping = one.ramping;
+        drive.comms.bus.run_inhibited = one.inhibited;
+        drive.command.request = one.in_effect;
+        drive.comms.command.request = one.received;
+        drive_background(&drive, &hal);
+        EXPECT_EQ((drive.self_test.failed & SELF_TEST_FAULT_LATCH) == 0, one.intact)
+            << one.ramping << one.inhibited << one.in_effect << one.received;
+    }
+}
+
 // [SR-51]
 TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
