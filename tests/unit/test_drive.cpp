@@ -971,8 +971,8 @@ TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
     EXPECT_TRUE(hal.open);
 }
 
-// Torque that would carry the speed beyond the last reference is none; towards the reference, and of torque mode, it
-// ramps. [SR-04]
+// Torque that would carry the speed beyond the last reference ends at once; towards it, and in torque mode, it ramps.
+// [SR-04]
 TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_in_either_direction) {
     const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
     ASSERT_TRUE(drive_init(&drive, &hal, &config));
@@ -1047,6 +1047,18 @@ TEST_F(Drive, as_a_node_of_canopen_it_speaks_that_protocol_alone_and_is_enabled_
     periods(4000);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE);
+}
+
+TEST_F(Drive, telemetry_has_the_scale_of_the_tables_single_pulses_and_the_controller) {
+    drive_telemetry_t values{};
+    for (const double scale : {0.75, 1.0, 1.25}) {
+        drive.control.table_scale.excess_q31 = int32_t((scale - 1.0) * 0x1p31);
+        drive.control.deferred.conduction.single_pulse = scale > 1.0;
+        telemetry_collect(&drive, &hal, hal.time_us, &values);
+        EXPECT_EQ(values.estimates.table_scale, unsigned(scale * 0x1p15));
+        EXPECT_EQ(values.status.single_pulse, scale > 1.0);
+    }
+    EXPECT_EQ(values.heartbeat.controller, unsigned(DRIVE_CONTROLLER_PAPER));
 }
 
 TEST_F(Drive, has_the_period_of_telemetry_of_its_configuration_and_else_the_parameter_s) {

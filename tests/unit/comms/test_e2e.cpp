@@ -215,4 +215,24 @@ TEST(E2e, restart_hears_a_sender_that_starts_again) {
     EXPECT_EQ(receiver.take(101), E2E_WRONG_SEQUENCE);
 }
 
+// [SR-36]
+TEST(E2e, restart_ends_the_lock_so_that_a_later_jump_is_believed_again) {
+    receiver_t receiver;
+    receiver.take(10);
+    receiver.locked = true;
+    e2e_receiver_restart(&receiver);
+    receiver.take(20);
+    receiver.take(100);
+    receiver.take(101);
+    EXPECT_EQ(receiver.take(102), E2E_RESYNCHRONISED);
+}
+
+TEST(E2e, a_frame_of_the_header_alone_has_a_checksum_like_any_other) {
+    uint8_t header[E2E_HEADER_BYTES] = {};
+    e2e_protect(DATA_ID, 7, header, sizeof header);
+    EXPECT_TRUE(e2e_checksum_matches(DATA_ID, header, sizeof header));
+    header[E2E_HEADER_BYTES - 1] ^= 1;
+    EXPECT_FALSE(e2e_checksum_matches(DATA_ID, header, sizeof header));
+}
+
 } // namespace

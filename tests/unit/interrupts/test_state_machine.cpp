@@ -286,6 +286,29 @@ TEST_F(StateMachine, a_persistent_clear_fault_clears_only_once) {
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_ENCODER)), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "a later fault is not cleared";
+    wait_until_the_cause_is_gone(COMMAND_CLEAR_FAULT);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "nor one that has failed in a single tick";
+}
+
+// [SR-40]
+TEST_F(StateMachine, a_fault_that_is_cleared_leaves_nothing_in_the_record) {
+    run();
+    step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    fault_record_t &record = state_machine.record;
+    record.time_us = 1; // as the caller completes it
+    record.speed_q22 = record.torque_reference_q24 = -2;
+    record.current_max_q9 = record.dc_link_voltage_q6 = 3;
+    step(COMMAND_OFF);
+    wait_until_the_cause_is_gone();
+    ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+    EXPECT_EQ(record.fault, FAULT_NONE);
+    EXPECT_EQ(record.fault_mask, 0u);
+    EXPECT_EQ(record.time_us, 0u);
+    EXPECT_EQ(record.speed_q22, 0);
+    EXPECT_EQ(record.torque_reference_q24, 0);
+    EXPECT_EQ(record.current_max_q9, 0);
+    EXPECT_EQ(record.dc_link_voltage_q6, 0);
+    EXPECT_EQ(record.state, 0);
 }
 
 // [SR-41]

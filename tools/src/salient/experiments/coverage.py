@@ -63,7 +63,7 @@ class Coverage:
     missed: Open = field(default_factory=dict)
 
     def unexplained(self, file: str, exceptions: Mapping[str, str]) -> Open:
-        """What is open: without a reason."""
+        """Open ones: those without a reason."""
         return {kind: [each for each in self.missed.get(kind, []) if f"{file}: {each[1]}" not in exceptions]
                 for kind in KINDS}
 
