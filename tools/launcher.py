@@ -90,12 +90,15 @@ WASM_DEPENDENCIES = (
     Dependency("libclang-rt-19-dev-wasm32", "its helpers",
                _file("/usr/lib/llvm-19/lib/clang/19/lib/wasi/libclang_rt.builtins-wasm32.a")),
 )
+COVERAGE = Dependency("libclang-rt-19-dev", "counters of what the unit tests cover",
+                      _file("/usr/lib/llvm-19/lib/clang/19/lib/linux/libclang_rt.profile-x86_64.a"))
 BROWSER = Dependency("chromium", "browser in which the live page is tested and measured", _tool("chromium"))
 TEST_DEPENDENCIES = (
     *WASM_DEPENDENCIES,
     Dependency("nodejs", "runs the drive in WebAssembly", _tool("node")),
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
     BROWSER,
+    COVERAGE,
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
 MEASUREMENT_DEPENDENCIES = (

@@ -27,11 +27,13 @@ void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *b
 /* Periods in succession whose compare values are not renewed before the switches open. */
 #define PERIODS_UNRENEWED_MAX 2
 
+/* [SR-01] [SR-10] [SR-45] */
 static void apply_break(board_t *board, uint32_t causes) {
     board->break_causes |= causes;
     plant_open_all(board->plant);
 }
 
+/* [SR-01] */
 void board_set_sto(board_t *board, unsigned line, bool energised) {
     board->sto_energised[line] = energised;
     if (!energised) {
@@ -39,17 +41,20 @@ void board_set_sto(board_t *board, unsigned line, bool energised) {
     }
 }
 
+/* [SR-01] [SR-10] */
 uint32_t board_pwm_break(const board_t *board) {
     return board->break_causes | (board->plant->tripped ? HAL_PWM_BREAK_OVER_CURRENT : 0u);
 }
 
+/* [SR-01] [SR-10] */
 void board_pwm_clear_break(board_t *board) {
     plant_clear_trip(board->plant);
     board->break_causes =
         (board->sto_energised[0] ? 0u : HAL_PWM_BREAK_STO_1) | (board->sto_energised[1] ? 0u : HAL_PWM_BREAK_STO_2);
 }
 
-/* Start of a period: compare values that were not renewed twice in succession, or a break, open the switches. */
+/* Start of a period: compare values that were not renewed twice in succession, or a break, open the switches.
+ * [SR-01] [SR-10] [SR-45] */
 static void drive_gates(board_t *board, bool busy) {
     /* Values that an interrupt still running has written count at its end. */
     if (busy || !board->renewed) {
@@ -68,10 +73,12 @@ static void drive_gates(board_t *board, bool busy) {
     }
 }
 
+/* [SR-45] */
 void board_stop_gates(board_t *board) {
     apply_break(board, HAL_PWM_BREAK_NOT_RENEWED);
 }
 
+/* [SR-45] */
 void board_reset(board_t *board, hal_reset_cause_t cause) {
     board_pwm_open_all(board);
     board->start_ns = board->time_ns;

@@ -135,7 +135,7 @@ void control_period_resume_background(control_period_t *period, uint64_t now_ns)
     shared_bus_start(&period->shared_bus);
 }
 
-/* A kick moves the time of the watchdog, and the event follows it when it is due. */
+/* A kick moves the time of the watchdog, and the event follows it when it is due. [SR-47] */
 void control_period_watch(control_period_t *period, uint64_t now_ns) {
     period->scheduler->due_ns[EVENT_WATCHDOG] = period->board->watchdog_ns;
     if (period->board->watchdog_ns > now_ns) {

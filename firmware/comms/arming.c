@@ -1,3 +1,4 @@
+/* [SR-34] */
 #include "comms/arming.h"
 
 #include "comms/counter.h"
@@ -14,6 +15,7 @@ void arming_init(arming_t *arming) {
 #define CHECK_ARMED 0x00ffu
 #define CHECK_CONFIGURING 0xff00u
 
+/* [SR-52] */
 COLD bool arming_is_intact(const arming_t *arming) {
     return arming->check == ((arming->armed ? CHECK_ARMED : 0u) | (arming->configuring ? CHECK_CONFIGURING : 0u));
 }
@@ -41,6 +43,7 @@ COLD void arming_check_timeout(arming_t *arming, uint32_t time_us) {
     }
 }
 
+/* [SR-35] */
 COLD void arming_disarm(arming_t *arming) {
     if (arming->attempt == ARMING_ATTEMPT_RUN) {
         end_attempt(arming);
@@ -76,6 +79,7 @@ static arming_result_t request(arming_t *arming, hal_t *hal, arming_attempt_t at
     return ARMING_CHALLENGED;
 }
 
+/* [SR-34] [SR-52] */
 COLD void arming_arm(arming_t *arming) {
     arming->changed = true;
     arming->armed = 1;

@@ -14,17 +14,20 @@ static_assert((int)HAL_CAN_ERROR_ACTIVE == (int)BUS_STATE_ERROR_ACTIVE &&
                   (int)HAL_CAN_BUS_OFF == (int)BUS_STATE_BUS_OFF,
               "HAL and drive.dbc have the same numbers");
 
+/* [SR-38] */
 COLD void bus_monitor_init(bus_monitor_t *monitor, uint32_t time_us) {
     *monitor = (bus_monitor_t){.wait_us = BUS_MONITOR_WAIT_MIN_US, .since_us = time_us};
 }
 
+/* [SR-38] */
 COLD static void enter_bus_off(bus_monitor_t *monitor, uint32_t time_us) {
     counter_add(&monitor->bus_off_count, 1);
     monitor->since_us = time_us;
     monitor->run_inhibited = true;
 }
 
-/* An attempt that has not succeeded when the next wait is over has failed: bus-off again before it was seen to end. */
+/* An attempt that has not succeeded when the next wait is over has failed: bus-off again before it was seen to end.
+ * [SR-38] */
 COLD static void wait_in_bus_off(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us) {
     if (time_us - monitor->since_us < monitor->wait_us) {
         return;
@@ -35,6 +38,7 @@ COLD static void wait_in_bus_off(bus_monitor_t *monitor, hal_t *hal, uint32_t ti
     monitor->wait_us = fixed_min_u32(doubled_us, BUS_MONITOR_WAIT_MAX_US);
 }
 
+/* [SR-37] [SR-38] */
 COLD void bus_monitor_step(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us) {
     const bool was_off = monitor->status.state == HAL_CAN_BUS_OFF;
     hal_can_status(hal, &monitor->status);
@@ -53,6 +57,7 @@ COLD void bus_monitor_step(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us)
     }
 }
 
+/* [SR-37] */
 COLD void bus_monitor_check(bus_monitor_t *monitor, const hal_can_frame_t *frame, uint32_t time_us) {
     bool own = frame->identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID;
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {

@@ -19,13 +19,14 @@ void commands_init(commands_t *commands) {
     arming_init(&commands->arming);
 }
 
+/* [SR-35] */
 COLD void commands_disarm(commands_t *commands) {
     arming_disarm(&commands->arming);
     commands->used = commands->ran = false;
     commands->errors = 0;
 }
 
-/* True when a drive that is armed must not remain so. */
+/* True when a drive that is armed must not remain so. [SR-35] */
 static bool must_disarm(const commands_t *commands, uint32_t time_us, uint32_t timeout_us) {
     const uint32_t silent_us = time_us - commands->last_received_us;
     const bool running = commands->state == DRIVE_STATE_RUN;
@@ -34,11 +35,12 @@ static bool must_disarm(const commands_t *commands, uint32_t time_us, uint32_t t
            (!commands->used && time_us - commands->armed_us > COMMANDS_ARMED_UNUSED_US);
 }
 
-/* Another sender is forgotten when its frames have not come for long enough. */
+/* Another sender is forgotten when its frames have not come for long enough. [SR-36] */
 static void expire_contest(commands_t *commands, uint32_t time_us) {
     commands->contested = commands->contested && time_us - commands->contested_us < COMMANDS_SENDER_LOST_US;
 }
 
+/* [SR-35] [SR-36] */
 COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t time_us, uint32_t timeout_us) {
     if (state == DRIVE_STATE_RUN && commands->state != DRIVE_STATE_RUN) {
         arming_end_configuration(&commands->arming);
@@ -57,12 +59,13 @@ COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t
     }
 }
 
+/* [SR-32] */
 static commands_frame_t reject(uint16_t *counter) {
     counter_add(counter, 1);
     return COMMANDS_REJECTED;
 }
 
-/* As reject, of a command frame. */
+/* As reject, of a command frame. [SR-33] */
 static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) {
     if (commands->arming.armed) {
         commands->errors = (uint16_t)(commands->errors + COMMANDS_ERROR_STEP);
@@ -78,7 +81,7 @@ static_assert(DRIVE_COMMAND_LENGTH == DRIVE_TORQUE_COMMAND_LENGTH, "both command
 static_assert(DRIVE_COMMAND_LENGTH == (unsigned)DRIVE_IDENTIFY_WINDOW_LENGTH, "likewise");
 static_assert(DRIVE_POSITION_COMMAND_LENGTH == (unsigned)DRIVE_IDENTIFY_COMMAND_LENGTH, "likewise");
 
-/* Writes an experiment, of which the window comes before the rest. As unpack. */
+/* Writes an experiment, of which the window comes before the rest. As unpack. [SR-32] */
 static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *identify, command_t *command) {
     if (frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID) {
         struct drive_identify_window_t window;
@@ -104,7 +107,7 @@ static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *id
     return true;
 }
 
-/* As unpack; the order and the position in its range are valid in every bit. */
+/* As unpack; the order and the position in its range are valid in every bit. [SR-32] */
 static bool unpack_position(const hal_can_frame_t *frame, command_t *command) {
     struct drive_position_command_t message;
     drive_position_command_unpack(&message, frame->data, frame->length);
@@ -124,7 +127,8 @@ static bool unpack_position(const hal_can_frame_t *frame, command_t *command) {
     return true;
 }
 
-/* Writes the request and the reference of a command with a valid checksum; false: out of range, nothing is written. */
+/* Writes the request and the reference of a command with a valid checksum; false: out of range, nothing is written.
+ * [SR-32] */
 static bool unpack(const hal_can_frame_t *frame, command_t *command) {
     if (frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID) {
         return unpack_position(frame, command);
@@ -152,7 +156,7 @@ static bool unpack(const hal_can_frame_t *frame, command_t *command) {
     return true;
 }
 
-/* Writes the command in effect: the last valid one, and off instead of run while not armed. */
+/* Writes the command in effect: the last valid one, and off instead of run while not armed. [SR-34] */
 static void publish(commands_t *commands, command_t *command) {
     *command = commands->requested;
     if (!command_needs_arming(command->request)) {
@@ -167,7 +171,7 @@ static void publish(commands_t *commands, command_t *command) {
 }
 
 /* Follows the sequence of a sender's commands. False: the frame is not the next one of the sender that commands; its
- * rejection is written. */
+ * rejection is written. [SR-36] */
 static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame, uint32_t time_us,
                           commands_frame_t *rejection) {
     commands_counters_t *counters = &commands->counters;
@@ -196,13 +200,14 @@ static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_
     }
 }
 
-/* In a run there is no fault to clear, and a run of one kind does not become one of the other. */
+/* In a run there is no fault to clear, and a run of one kind does not become one of the other. [SR-33] [SR-36] */
 static bool may_follow(const commands_t *commands, command_request_t request) {
     const command_request_t before = commands->requested.request;
     const bool changes_kind = command_needs_arming(request) && command_needs_arming(before) && request != before;
     return commands->state != DRIVE_STATE_RUN || (request != COMMAND_CLEAR_FAULT && !changes_kind);
 }
 
+/* [SR-32] [SR-33] */
 static commands_frame_t receive_command(commands_t *commands, unsigned data_id, const hal_can_frame_t *frame,
                                         uint32_t time_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;
@@ -241,7 +246,7 @@ static commands_frame_t receive_command(commands_t *commands, unsigned data_id, 
 }
 
 /* The drive is armed for the sender of the last command, which must not be older than the command timeout; not while
- * valid commands of another sequence come as well, because that may be the one of who confirms. */
+ * valid commands of another sequence come as well, because that may be the one of who confirms. [SR-34] */
 static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                        uint32_t timeout_us, command_t *command) {
     if (frame->length != DRIVE_ARM_LENGTH) {
@@ -274,7 +279,7 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
 
 static_assert(DRIVE_PARAMETER_WRITE_LENGTH == DRIVE_PARAMETER_SET_CONTROL_LENGTH, "one check of their length");
 
-/* The byte after the header is an index or a step. */
+/* The byte after the header is an index or a step. [SR-32] [SR-56] */
 static commands_frame_t receive_set(commands_t *commands, unsigned data_id, unsigned end, const hal_can_frame_t *frame,
                                     uint32_t time_us) {
     commands_counters_t *counters = &commands->counters;
@@ -299,6 +304,7 @@ static commands_frame_t receive_set(commands_t *commands, unsigned data_id, unsi
     return control || commands->arming.configuring ? COMMANDS_PARAMETER_SET : COMMANDS_REJECTED;
 }
 
+/* [SR-32] */
 commands_frame_t commands_receive(commands_t *commands, hal_t *hal, const hal_can_frame_t *frame, uint32_t time_us,
                                   uint32_t timeout_us, command_t *command) {
     commands_counters_t *counters = &commands->counters;

@@ -42,6 +42,7 @@ COLD position_status_t *comms_place(comms_t *comms) {
     return is_canopen(comms) ? &comms->canopen.place : NULL;
 }
 
+/* [SR-35] */
 COLD void comms_bus_off(comms_t *comms) {
     if (!is_canopen(comms)) {
         commands_disarm(&comms->commands);

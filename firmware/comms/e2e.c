@@ -1,3 +1,4 @@
+/* [SR-32] */
 #include "comms/e2e.h"
 
 #define POLYNOMIAL 0x1021u
@@ -48,6 +49,7 @@ bool e2e_checksum_matches(uint16_t data_id, const uint8_t *bytes, size_t length)
     return length >= E2E_HEADER_BYTES && checksum_of(bytes) == checksum(data_id, bytes, length);
 }
 
+/* [SR-32] [SR-36] */
 e2e_result_t e2e_check(e2e_receiver_t *receiver, uint16_t data_id, const uint8_t *bytes, size_t length) {
     if (!e2e_checksum_matches(data_id, bytes, length)) {
         return E2E_WRONG_CHECKSUM;

@@ -1,9 +1,11 @@
+/* [SR-56] */
 #include "comms/parameter_set.h"
 
 #include "comms/e2e.h"
 #include "drive_codec.h"
 #include "fixed/crc32.h"
 
+/* [SR-56] [SR-57] */
 static void begin(parameter_set_t *set, const parameters_t *parameters, bool defaults) {
     set->begun = true;
     set->crc = 0;
@@ -27,6 +29,7 @@ void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame) {
     set->crc = crc32_continue(set->crc, frame->data + E2E_HEADER_BYTES, frame->length - E2E_HEADER_BYTES);
 }
 
+/* [SR-56] [SR-57] */
 static parameters_verdict_t apply(const parameter_set_t *set, uint32_t crc, parameters_t *parameters,
                                   const parameters_conditions_t *conditions) {
     if (!set->begun || crc != set->crc) {
@@ -76,6 +79,7 @@ parameters_verdict_t parameter_set_one(parameter_set_t *set, parameters_t *param
     return parameter_set_finish(set, parameters, conditions);
 }
 
+/* [SR-56] [SR-57] */
 static parameters_verdict_t save(nvm_store_t *store, bool running) {
     if (running) {
         return (parameters_verdict_t){PARAMETER_STATUS_NOT_WHILE_RUNNING, 0, 0};

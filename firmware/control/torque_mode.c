@@ -17,6 +17,7 @@ torque_mode_parameters_t torque_mode_configure(int32_t slew_rate_q10, uint32_t c
     };
 }
 
+/* [SR-08] */
 int32_t torque_mode_step(const torque_mode_parameters_t *parameters, torque_mode_t *mode, int32_t commanded_q24,
                          int32_t speed_q22) {
     const int32_t target_q24 = fixed_clamp(commanded_q24, parameters->torque_min_q24, parameters->torque_max_q24);

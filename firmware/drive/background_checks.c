@@ -169,7 +169,7 @@ COLD static uint32_t check_flux(drive_t *drive, hal_t *hal, const flux_sample_t 
     return failed;
 }
 
-/* For telemetry. Words of several moments, because interrupts come in between: each is one word. */
+/* For telemetry. Words of several moments, because interrupts come in between: each is one word. [SR-09] */
 COLD static available_torque_t find_available_torque(const drive_t *drive, int32_t by_heat_q24) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const control_state_t *control = &drive->control;
@@ -193,7 +193,7 @@ COLD static available_torque_t find_available_torque(const drive_t *drive, int32
     return available_torque(&input);
 }
 
-/* Each current is one word: a control interrupt in between changes none while it is read. */
+/* Each current is one word: a control interrupt in between changes none while it is read. [SR-16] [SR-17] */
 COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
     const temperature_t *temperature = &drive->temperature;
@@ -208,7 +208,7 @@ COLD static void follow_heat(drive_t *drive, hal_t *hal, uint32_t time_us) {
 
 /* False when the request in effect is not the one that the bus has brought: one of both copies has changed. The last
  * one before a bus-off is not taken, and lets the one before age; the ramp of overdue commands runs after a stop, too.
- */
+ * [SR-51] */
 COLD static bool is_commanded(const drive_t *drive) {
     const command_request_t received = drive->comms.command.request;
     return drive->command.request == received || drive->comms.bus.run_inhibited ||
@@ -216,21 +216,21 @@ COLD static bool is_commanded(const drive_t *drive) {
 }
 
 /* False when the arming has changed, or what decides how long it lasts: an armed drive has had its last command no
- * earlier than the last frame of its sender. */
+ * earlier than the last frame of its sender. [SR-52] */
 COLD static bool is_arming_intact(const drive_t *drive, uint32_t time_us) {
     const commands_t *commands = &drive->comms.commands;
     const bool in_order = time_us - commands->last_received_us <= time_us - drive->comms.command.time_us;
     return arming_is_intact(&commands->arming) && (in_order || commands->arming.armed == 0);
 }
 
-/* False when one of both notes of the lost phase has changed. */
+/* False when one of both notes of the lost phase has changed. [SR-51] */
 COLD static bool is_lost_phase_intact(const drive_t *drive) {
     const uint32_t number = drive->control.lost_phase;
     return number <= machine_tables.phases && drive->degraded.lost == UINT32_C(1) << number >> 1;
 }
 
 /* A latch that has changed is not to be trusted: the drive is in fault from here on, and of a run that this has ended
- * nothing is left. */
+ * nothing is left. [SR-51] */
 COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
     self_test_t *test = &drive->self_test;
     state_machine_t *state_machine = &drive->control.state_machine;
@@ -251,7 +251,7 @@ COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
 }
 
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared
- * outside a run, or the parameter no longer allows it, which changes there only. */
+ * outside a run, or the parameter no longer allows it, which changes there only. [SR-31] */
 COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     const degraded_parameters_t *parameters = &drive->control_parameters.degraded;
     const bool run = drive->control.state_machine.state == DRIVE_STATE_RUN;
@@ -269,7 +269,7 @@ COLD static uint32_t follow_lost_phase(drive_t *drive, uint32_t failed) {
     return failed;
 }
 
-/* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. */
+/* Checks phases, encoder, stall and STO lines, unless the sample cannot be read. [SR-03] [SR-07] [SR-24] */
 COLD static void check(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const control_parameters_t *parameters = &drive->control_parameters;
     sample_t sample = {.flux = {.lost_phases = drive->degraded.lost,
@@ -297,6 +297,7 @@ COLD static void check(drive_t *drive, hal_t *hal, uint32_t time_us) {
     drive->failed_checks = failed;
 }
 
+/* [SR-16] [SR-17] [SR-33] [SR-37] [SR-50] [SR-53] [SR-55] [SR-58] */
 COLD void background_checks(drive_t *drive, hal_t *hal, uint32_t time_us) {
     follow_heat(drive, hal, time_us);
     test_itself(drive, hal, time_us);

@@ -22,13 +22,13 @@
 #define PROCESSOR_TIME_HZ 200000000
 
 /* True while the drive does not run and cannot begin to: a run starts with a command that only the background
- * publishes. */
+ * publishes. [SR-56] */
 static bool may_configure(const drive_t *drive) {
     return drive->control.state_machine.state != DRIVE_STATE_RUN && !command_needs_arming(drive->command.request);
 }
 
 /* Applies the parameters in one piece between two control periods; in a run or beside the command that starts one, in
- * parts, those that may then be changed, which are all that differ. */
+ * parts, those that may then be changed, which are all that differ. [SR-56] */
 COLD static void configure(drive_t *drive, hal_t *hal) {
     control_parameters_t control_parameters =
         configure_control(&drive->parameters, &machine_tables, drive->parameters.control_rate_hz, hal_encoder_bits(hal),
@@ -53,6 +53,7 @@ COLD static void configure(drive_t *drive, hal_t *hal) {
     self_test_configured(&drive->self_test, &drive->control_parameters);
 }
 
+/* [SR-48] [SR-53] [SR-58] */
 COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
     const uint32_t clock_hz = hal_pwm_clock_hz(hal);
     if (!configure_rate_allowed(config->control_rate_hz, clock_hz) ||
@@ -130,6 +131,7 @@ NOINLINE static void experiment(drive_t *drive, hal_t *hal, const hal_adc_sample
     }
 }
 
+/* [SR-39] */
 void drive_control_interrupt(drive_t *drive, hal_t *hal) {
     hal_adc_sample_t adc;
     control_sample_t sample = {
@@ -197,7 +199,7 @@ void drive_deferred_interrupt(drive_t *drive, hal_t *hal) {
     deferred_complete(&control->deferred_request, &control->deferred.response);
 }
 
-/* Both copies: background_checks.c compares them. */
+/* Both copies: background_checks.c compares them. [SR-34] */
 COLD static void withdraw_command(drive_t *drive, hal_t *hal) {
     hal_critical_enter(hal);
     drive->command.request = COMMAND_OFF;
@@ -206,7 +208,7 @@ COLD static void withdraw_command(drive_t *drive, hal_t *hal) {
 }
 
 /* Withdraws a command to run that must not start a run later: without being armed. Silence disarms, so that none
- * becomes so old that the clock wraps and its age appears small again. */
+ * becomes so old that the clock wraps and its age appears small again. [SR-34] */
 static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
     if (command_needs_arming(drive->command.request) && !drive->comms.commands.arming.armed &&
         drive->control.state_machine.state != DRIVE_STATE_RUN) {
@@ -215,7 +217,7 @@ static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
 }
 
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
- * timeout, and a sender that simply continues does not start the drive again. */
+ * timeout, and a sender that simply continues does not start the drive again. [SR-38] */
 COLD static void take_command(drive_t *drive, hal_t *hal) {
     const command_t *command = &drive->comms.command;
     bus_monitor_t *bus = &drive->comms.bus;
@@ -243,7 +245,7 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
 }
 
 /* Log of faults and storing of parameters. No operation of the memory in RUN, nor when the next control interrupt may
- * enter it: a command to run has been handed over. */
+ * enter it: a command to run has been handed over. [SR-60] */
 static void keep_memory(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const drive_state_t state = drive->control.state_machine.state;
     if (state == DRIVE_STATE_FAULT) {
@@ -261,7 +263,7 @@ static void keep_memory(drive_t *drive, hal_t *hal, uint32_t time_us) {
     nvm_store_step(&drive->store, hal, &drive->parameters, time_us, writable);
 }
 
-/* The torque would carry the speed on, beyond the last reference. */
+/* The torque would carry the speed on, beyond the last reference. [SR-04] */
 COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
     const int32_t reference_q22 =
         speed_control_limited_q22(&drive->control_parameters, drive->command.speed_reference_q22);
@@ -271,7 +273,7 @@ COLD static bool runs_away(const drive_t *drive, int32_t torque_q24) {
 }
 
 /* In a run whose commands are overdue: ramps the torque from its present value to zero, by commands of the torque mode
- * with the time of the last valid command, so that the interrupts need nothing for it. */
+ * with the time of the last valid command, so that the interrupts need nothing for it. [SR-04] */
 static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const uint32_t timeout_us = (uint32_t)drive->parameters.values[PARAMETER_COMMAND_TIMEOUT_MS] * 1000u;
     const uint32_t age_us = time_us - drive->command.time_us;
@@ -304,7 +306,7 @@ static void ramp_down(drive_t *drive, hal_t *hal, uint32_t time_us) {
     hal_critical_leave(hal);
 }
 
-/* Two words of each interrupt: one that comes in between advances what is read after it, by one step. */
+/* Two words of each interrupt: one that comes in between advances what is read after it, by one step. [SR-47] */
 COLD static void kick_watchdog(drive_t *drive, hal_t *hal, uint32_t time_us) {
     const deferred_request_t *request = &drive->control.deferred_request;
     const volatile uint32_t *completed = &drive->control.deferred.response.completed;

@@ -134,7 +134,8 @@ static torque_sharing_parameters_t sharing_from(const int32_t *values, const mac
     };
 }
 
-/* The fields of the phases hardly raise a large DC link: a 32nd of the over-voltage threshold is the least range. */
+/* The fields of the phases hardly raise a large DC link: a 32nd of the over-voltage threshold is the least range.
+ * [SR-14] */
 static int32_t fold_back_range_q6(int32_t over_voltage_q6, int32_t range_q6) {
     return fixed_max(range_q6, over_voltage_q6 / 32);
 }

@@ -18,6 +18,7 @@ void control_reset(const control_parameters_t *parameters, control_state_t *stat
         table_scale_factors(TABLE_SCALE_ONE_Q30, parameters->predictive.period_q40, &parameters->predictive.flux);
 }
 
+/* [SR-44] */
 void control_prepare(const control_parameters_t *parameters, control_state_t *state) {
     bp_pid_clear_telemetry(&state->duty.pid); /* of a law that the parameters have changed */
     torque_control_reset(parameters, state);
@@ -45,6 +46,7 @@ static uint64_t protect(const control_parameters_t *parameters, control_state_t 
     return protection_check(&parameters->protection, &state->protection, &input);
 }
 
+/* [SR-39] */
 bool control_step(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                   const command_t *command, hal_pwm_compare_t *compare) {
     const deferred_results_t *deferred = deferred_in_effect(state);

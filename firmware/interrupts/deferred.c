@@ -16,7 +16,7 @@
 /* From the slopes of a sample to their effect on the load observer, periods. */
 #define SLOPE_LAG_PERIODS 5
 
-/* Resets what the control interrupt has reset since the previous step. */
+/* Resets what the control interrupt has reset since the previous step. [SR-44] */
 NOINLINE static void follow_resets(const control_parameters_t *parameters, deferred_t *deferred,
                                    const deferred_input_t *input) {
     const uint32_t changed = deferred->generation ^ input->generation;

@@ -7,6 +7,7 @@
 /* Part of the largest torque that an acceleration asks for from which on it shows the inertia. */
 #define ACCELERATION_SHARE 32
 
+/* [SR-09] */
 static int32_t torque_limit_q24(const control_parameters_t *parameters, const control_state_t *state) {
     const int32_t limit_q24 = state->torque_limit_q24;
     return position_seeks_stop(&state->position) ? fixed_min(limit_q24, parameters->position.homing_torque_q24)

@@ -30,6 +30,7 @@ static inline uint32_t word(const void *object, unsigned index) {
     return ((const any_word_t *)object)[index];
 }
 
+/* [SR-53] */
 COLD void self_test_init(self_test_t *test, const hal_t *hal, uint32_t time_us) {
     *test = (self_test_t){
         .step_us = time_us,
@@ -55,7 +56,7 @@ COLD void self_test_configured(self_test_t *test, const control_parameters_t *pa
     }
 }
 
-/* A run that ends takes its duties back in the same interrupt. */
+/* A run that ends takes its duties back in the same interrupt. [SR-51] */
 static bool has_duties(const control_state_t *control) {
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
         if (control->duty_q15[phase] != -MODULATOR_DUTY_ONE_Q15) {
@@ -65,6 +66,7 @@ static bool has_duties(const control_state_t *control) {
     return false;
 }
 
+/* [SR-51] */
 COLD bool self_test_latch_intact(const control_state_t *control) {
     const drive_state_t state = control->state_machine.state;
     const fault_record_t *record = &control->state_machine.record;
@@ -73,6 +75,7 @@ COLD bool self_test_latch_intact(const control_state_t *control) {
            (state == DRIVE_STATE_RUN || !has_duties(control));
 }
 
+/* [SR-50] */
 static void check_constants(self_test_t *test, const control_parameters_t *parameters) {
     for (unsigned i = 0; i < CONSTANTS_SLICE && test->sum_word < CONSTANTS_WORDS; i++) {
         test->sum = add(test->sum, word(parameters, test->sum_word++));
@@ -83,7 +86,8 @@ static void check_constants(self_test_t *test, const control_parameters_t *param
     }
 }
 
-/* No pass comes to a word beyond the last one, as below to one beyond the stack: its number has changed in memory. */
+/* No pass comes to a word beyond the last one, as below to one beyond the stack: its number has changed in memory.
+ * [SR-53] */
 static void check_code(self_test_t *test, const hal_memory_t *memory) {
     for (unsigned i = 0; i < CODE_SLICE && test->crc_word < memory->code_words; i++) {
         test->crc = crc32_continue(test->crc, &memory->code[test->crc_word++], sizeof(uint32_t));
@@ -95,7 +99,7 @@ static void check_code(self_test_t *test, const hal_memory_t *memory) {
     }
 }
 
-/* The first used word ends a pass. */
+/* The first used word ends a pass. [SR-54] */
 static void follow_stack(self_test_t *test, const hal_memory_t *memory) {
     for (unsigned i = 0; i < STACK_SLICE; i++) {
         if (test->stack_word >= memory->stack_words || memory->stack[test->stack_word] != HAL_STACK_UNUSED) {
@@ -107,7 +111,8 @@ static void follow_stack(self_test_t *test, const hal_memory_t *memory) {
     }
 }
 
-/* Both clocks at one instant: interrupts may have held this pass of the background for longer than the tolerance. */
+/* Both clocks at one instant: interrupts may have held this pass of the background for longer than the tolerance.
+ * [SR-55] */
 static void check_clock(self_test_t *test, hal_t *hal, uint32_t pass_us) {
     if (pass_us - test->clock_us < SELF_TEST_CLOCK_US) {
         return;
@@ -125,6 +130,7 @@ static void check_clock(self_test_t *test, hal_t *hal, uint32_t pass_us) {
     test->clock_reference_us = reference_us;
 }
 
+/* [SR-49] [SR-50] [SR-53] [SR-54] [SR-55] [SR-57] */
 COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters_t *constants,
                          const parameters_t *parameters, uint32_t time_us) {
     for (unsigned i = 0; i < SELF_TEST_LIMIT_WORDS; i++) {
@@ -151,6 +157,7 @@ COLD void self_test_step(self_test_t *test, hal_t *hal, const control_parameters
     check_clock(test, hal, time_us);
 }
 
+/* [SR-49] [SR-50] [SR-53] [SR-54] [SR-55] */
 COLD uint32_t self_test_faults(const self_test_t *test) {
     const uint32_t memory = SELF_TEST_LIMITS | SELF_TEST_CONSTANTS | SELF_TEST_FAULT_LATCH | SELF_TEST_STACK |
                             SELF_TEST_REGISTERS | SELF_TEST_PARAMETERS;

@@ -70,6 +70,7 @@ static int32_t torque_law_q24(const control_parameters_t *parameters, deferred_t
     return fixed_add(torque_q24, offset_q24);
 }
 
+/* [SR-08] [SR-09] [SR-14] */
 ALWAYS_INLINE void compute_law(const control_parameters_t *parameters, deferred_t *deferred,
                                const deferred_input_t *input, const command_t *command, int32_t limit_q24,
                                deferred_results_t *results) {
@@ -121,6 +122,7 @@ NOINLINE void speed_control_position(const control_parameters_t *parameters, def
     compute_law(parameters, deferred, input, command, limit_q24, results);
 }
 
+/* [SR-09] */
 void speed_control_limit_uncertain(const control_parameters_t *parameters, int32_t load_q24,
                                    deferred_speed_results_t *results) {
     const int32_t most_q24 = parameters->conduction.torque_max_q24;

@@ -1,3 +1,4 @@
+/* [SR-39] */
 #include "interrupts/state_machine.h"
 
 #include "fixed/compiler.h"
@@ -14,6 +15,7 @@ fault_t state_machine_first_fault(uint64_t fault_mask) {
     return (fault_t)(low != 0 ? __builtin_ctz(low) : 32 + __builtin_ctz((uint32_t)(fault_mask >> 32)));
 }
 
+/* [SR-39] [SR-40] [SR-42] */
 static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     fault_record_t *record = &state_machine->record; /* the caller sets its other members */
     record->fault = state_machine_first_fault(fault_mask);
@@ -27,11 +29,12 @@ static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     return true;
 }
 
+/* [SR-48] [SR-51] */
 COLD void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t fault_mask) {
     latch_fault(state_machine, fault_mask);
 }
 
-/* The record by members, because a call of memset takes 44 instructions. */
+/* The record by members, because a call of memset takes 44 instructions. [SR-41] */
 static void end_fault(state_machine_t *state_machine) {
     fault_record_t *record = &state_machine->record;
     state_machine->state = DRIVE_STATE_READY;
@@ -45,6 +48,7 @@ static void end_fault(state_machine_t *state_machine) {
     record->state = 0;
 }
 
+/* [SR-39] [SR-41] [SR-42] [SR-43] */
 bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, command_request_t request,
                           uint32_t initialise_ticks) {
     const uint64_t all_but_timeout = fault_mask & ~FAULT_BIT(FAULT_COMMAND_TIMEOUT);

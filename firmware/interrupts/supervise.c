@@ -9,6 +9,7 @@
 /* A stop ends below this speed: 0.5 rad/s, 5 r/min. */
 #define STANDSTILL_Q22 (1u << 21)
 
+/* [SR-40] */
 static void complete_record(fault_record_t *record, const control_state_t *state, uint32_t time_us) {
     const control_measurement_t *measured = &state->measurement;
     record->time_us = time_us;
@@ -23,6 +24,7 @@ static void complete_record(fault_record_t *record, const control_state_t *state
     record->dc_link_voltage_q6 = (uint16_t)measured->dc_link_voltage_q6;
 }
 
+/* [SR-44] */
 NOINLINE static void end_run(const control_parameters_t *parameters, control_state_t *state) {
     state->torque_reference_q24 = 0;
     state->slip.periods = 0;
@@ -41,7 +43,7 @@ static void await_load(const control_parameters_t *parameters, control_state_t *
 }
 
 /* Out of the way of a run, which is the longer path. The time by value: a sample whose address is passed on would have
- * to be in memory as a whole. */
+ * to be in memory as a whole. [SR-39] [SR-40] [SR-44] */
 NOINLINE static void stand(const control_parameters_t *parameters, control_state_t *state, uint32_t time_us,
                            uint64_t fault_mask, command_request_t request) {
     state_machine_t *state_machine = &state->state_machine;
@@ -67,6 +69,7 @@ NOINLINE static void stand(const control_parameters_t *parameters, control_state
     }
 }
 
+/* [SR-06] [SR-39] */
 bool supervise(const control_parameters_t *parameters, control_state_t *state, const control_sample_t *sample,
                const command_t *command, uint64_t fault_mask) {
     state_machine_t *state_machine = &state->state_machine;

@@ -68,6 +68,7 @@ static uint32_t square_root(uint64_t square) {
     return root;
 }
 
+/* [SR-21] [SR-30] */
 int32_t angle_evidence_flux_error_q29(int64_t acceleration, int32_t current_q9, int32_t angle_step_q32,
                                       uint32_t rotor_poles) {
     const int64_t clamped = acceleration < ACCELERATION_MAX ? acceleration : ACCELERATION_MAX;
@@ -154,14 +155,14 @@ static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
 /* Fastest parting that a rotor can cause whose motion the encoder does not show, per control period, Wb, Q2.29: its
  * back-EMF a sixteenth of the DC-link voltage, above which a rotor that turned before is found by its travel
  * (monitors/protection.h), or a free rotor's from rest after 32 degrees. What parts faster is a fault of the
- * phase.
- */
+ * phase. [SR-21] */
 static int32_t fastest_parting_q29(const common_t *common) {
     const int32_t turning_q29 = common->residual->sample.period_flux_q29 / 16;
     const int32_t from_rest_q29 = fixed_saturate(8 * (int64_t)common->parameters->flux_error_q29);
     return turning_q29 > from_rest_q29 ? turning_q29 : from_rest_q29;
 }
 
+/* [SR-21] */
 static void refer(const common_t *common, angle_evidence_phase_t *state, const flux_residual_phase_t *phase,
                   int32_t excess_q29, int32_t table_q29) {
     state->referred = true;
@@ -174,7 +175,7 @@ static void refer(const common_t *common, angle_evidence_phase_t *state, const f
     state->moved = 0;
 }
 
-/* True when integral and tables have parted since the encoder has been at its present count. */
+/* True when integral and tables have parted since the encoder has been at its present count. [SR-21] */
 static bool has_moved(const common_t *common, angle_evidence_phase_t *state, const flux_residual_phase_t *phase,
                       uint32_t distance) {
     const uint32_t rate_hz = common->parameters->rate_hz, periods = common->residual->elapsed;
@@ -218,7 +219,7 @@ static bool has_moved(const common_t *common, angle_evidence_phase_t *state, con
 }
 
 /* Counts the periods for which the flux linkage has contradicted the angle. True when it does, or is beyond half of its
- * tolerance. */
+ * tolerance. [SR-22] */
 static bool contradicts(const common_t *common, angle_evidence_phase_t *state, const flux_residual_phase_t *phase,
                         uint32_t distance) {
     const angle_evidence_parameters_t *parameters = common->parameters;
@@ -258,7 +259,7 @@ static bool interrupted(const common_t *common, angle_evidence_phase_t *state, c
     return state->interrupted;
 }
 
-/* True while a phase has shown a contradiction in the last quarter of a second. */
+/* True while a phase has shown a contradiction in the last quarter of a second. [SR-22] */
 static bool shows(const common_t *common, angle_evidence_phase_t *state) {
     const uint32_t period = common->residual->sample.periods;
     if (state->contradicted >= PERSISTENT_PERIODS) {
@@ -269,7 +270,7 @@ static bool shows(const common_t *common, angle_evidence_phase_t *state) {
     return state->shown;
 }
 
-/* Notes how long a phase that is checked has been consistent with the angle. */
+/* Notes how long a phase that is checked has been consistent with the angle. [SR-22] */
 static void note_agreement(const common_t *common, angle_evidence_phase_t *state) {
     state->agrees = state->contradicted == 0 ? state->agrees + common->residual->elapsed : 0;
     if (state->agrees > common->parameters->rate_hz >> AGREES_SHIFT) {
@@ -278,7 +279,7 @@ static void note_agreement(const common_t *common, angle_evidence_phase_t *state
     }
 }
 
-/* Forgets what is longer ago than it counts, before the number of the period comes round. */
+/* Forgets what is longer ago than it counts, before the number of the period comes round. [SR-22] */
 static void forget_old(const common_t *common, angle_evidence_t *state) {
     const uint32_t period = common->residual->sample.periods, rate_hz = common->parameters->rate_hz;
     state->advanced = state->advanced && period - state->advanced_at <= rate_hz >> ALONE_SHIFT;
@@ -291,7 +292,7 @@ static void forget_old(const common_t *common, angle_evidence_t *state) {
 
 /* True when two of the other phases, or all that are not lost, have been consistent with the angle in the last quarter
  * of a second. One that is left is enough: what it has shown, it contradicts when it conducts the next time, if the
- * encoder is wrong. */
+ * encoder is wrong. [SR-22] */
 static bool others_agree(const common_t *common, const angle_evidence_t *state, unsigned index) {
     bool all = true;
     unsigned agreeing = 0;
@@ -305,7 +306,7 @@ static bool others_agree(const common_t *common, const angle_evidence_t *state, 
     return all || agreeing >= AGREEING_PHASES;
 }
 
-/* True while the encoder shows a rotor that turns the way the torque drives it. */
+/* True while the encoder shows a rotor that turns the way the torque drives it. [SR-22] */
 static bool advances(const common_t *common, angle_evidence_t *state) {
     const flux_sample_t *sample = &common->residual->sample;
     const int32_t least = common->parameters->advance_min;
@@ -321,6 +322,7 @@ static bool advances(const common_t *common, angle_evidence_t *state) {
     return state->advanced;
 }
 
+/* [SR-21] [SR-22] */
 static void check_phase(const common_t *common, angle_evidence_t *state, unsigned index, bool counted,
                         flux_evidence_t *evidence) {
     angle_evidence_phase_t *phase_state = &state->phase[index];
@@ -344,7 +346,7 @@ static void check_phase(const common_t *common, angle_evidence_t *state, unsigne
 }
 
 /* A run that has ended leaves nothing that counts but `parted`: an advance is forgotten sooner than a contradiction may
- * last. */
+ * last. [SR-22] */
 static void forget(angle_evidence_t *state, uint32_t encoder_angle) {
     state->counted = false;
     state->waypoint = encoder_angle;
@@ -357,6 +359,7 @@ static void forget(angle_evidence_t *state, uint32_t encoder_angle) {
     }
 }
 
+/* [SR-21] [SR-22] */
 COLD void angle_evidence_step(const angle_evidence_parameters_t *parameters, angle_evidence_t *state,
                               const flux_residual_t *residual, flux_evidence_t *evidence) {
     const uint32_t encoder_angle = residual->sample.encoder_angle;

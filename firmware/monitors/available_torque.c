@@ -1,3 +1,4 @@
+/* [SR-09] */
 #include "monitors/available_torque.h"
 
 #include "fixed/compiler.h"

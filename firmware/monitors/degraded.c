@@ -1,3 +1,4 @@
+/* [SR-31] */
 #include "monitors/degraded.h"
 
 #include "control/phase_map.h"

@@ -21,7 +21,7 @@
 #define REVERSED_SHIFT 2
 
 /* Notes when the encoder has turned round. clear: faster than its counts and the rotor's swings. The first direction
- * since a reset of the drive, whose rotor may turn backwards, is no turn round. */
+ * since a reset of the drive, whose rotor may turn backwards, is no turn round. [SR-23] */
 static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear, uint32_t rate_hz) {
     const bool backwards = turned < 0;
     monitor->turned =
@@ -38,6 +38,7 @@ static void note_reversal(encoder_monitor_t *monitor, int32_t turned, bool clear
     monitor->turned_at = monitor->window_period;
 }
 
+/* [SR-07] */
 static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                         const flux_residual_t *residual) {
     const flux_sample_t *sample = &residual->sample;
@@ -65,6 +66,7 @@ static void check_speed(const encoder_monitor_parameters_t *parameters, encoder_
     note_reversal(monitor, turned, travel > (least > change ? least : change) + count, parameters->rate_hz);
 }
 
+/* [SR-07] [SR-23] */
 COLD void encoder_monitor_step(const encoder_monitor_parameters_t *parameters, encoder_monitor_t *monitor,
                                const flux_residual_t *residual) {
     const flux_sample_t *sample = &residual->sample;

@@ -10,6 +10,7 @@ static uint32_t shorted_phases(const flux_evidence_t *evidence) {
     return evidence->excess_moves | evidence->too_much_at_angle;
 }
 
+/* [SR-29] */
 fault_t flux_monitor_verdict(const flux_evidence_t *e, uint32_t phases) {
     const uint32_t open = open_phases(e), shorted = shorted_phases(e);
     const uint32_t phase = open | shorted | e->excess_still | e->unbalanced;
@@ -34,12 +35,14 @@ static uint32_t failed_phases(const flux_evidence_t *evidence) {
     return failed;
 }
 
+/* [SR-29] [SR-31] */
 void flux_monitor_forget(flux_monitor_t *monitor) {
     monitor->failed = 0;
     monitor->balance = (phase_balance_t){0};
     phase_evidence_forget(&monitor->phases_by_current);
 }
 
+/* [SR-29] */
 COLD uint32_t flux_monitor_step(const flux_monitor_parameters_t *parameters, flux_monitor_t *monitor,
                                 const flux_sample_t *sample) {
     flux_residual_t *residual = &monitor->residual;

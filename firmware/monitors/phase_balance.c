@@ -1,3 +1,4 @@
+/* [SR-28] */
 #include "monitors/phase_balance.h"
 
 #include "control/applied_flux.h"

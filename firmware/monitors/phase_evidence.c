@@ -37,7 +37,7 @@ typedef enum {
     BEYOND_ANGLES  /* differs at any */
 } difference_t;
 
-/* Flux linkage of the tables with the tolerances of current and flux linkage. */
+/* Flux linkage of the tables with the tolerances of current and flux linkage. [SR-30] */
 static flux_band_t tolerated(const flux_residual_t *residual, uint32_t distance, uint32_t width, int32_t current_q9,
                              int32_t more_q9) {
     const flux_band_t band = flux_residual_band(distance, width, (current_q9 - residual->offset_q9) * 10 / 11,
@@ -63,7 +63,8 @@ static int32_t built_up_q29(const flux_residual_t *residual, phase_evidence_phas
     return built_q29;
 }
 
-/* The flux linkage by the tables is between the limits of both sides, so that most comparisons end with it. */
+/* The flux linkage by the tables is between the limits of both sides, so that most comparisons end with it.
+ * [SR-25] [SR-27] [SR-30] */
 static difference_t compare(const flux_residual_t *residual, phase_evidence_phase_t *state, unsigned index, int *side) {
     const flux_residual_phase_t *phase = &residual->phase[index];
     const int32_t table_q29 = phase->table_q29;
@@ -98,7 +99,7 @@ static difference_t compare(const flux_residual_t *residual, phase_evidence_phas
 
 /* True when the opposite voltage has removed a quarter of the flux linkage since the switches opened, and the tables
  * saw less than a quarter of that part disappear. Parts, because at a wrong angle the tables err by a factor; of a flux
- * linkage from which that may have taken away something. */
+ * linkage from which that may have taken away something. [SR-27] */
 static bool does_not_fall(const flux_residual_t *residual, phase_evidence_phase_t *state,
                           const flux_residual_phase_t *phase) {
     const int32_t flux_q29 = phase->flux_q29;
@@ -117,7 +118,7 @@ static bool does_not_fall(const flux_residual_t *residual, phase_evidence_phase_
 
 /* True when the integral has gone only because the tables have taken most of it away, more than a warm winding and the
  * drops of the devices explain, a seventh of the error of the voltage, twice that after a small current: by voltage and
- * time alone the current may flow, and it is the angle of the tables that is wrong. */
+ * time alone the current may flow, and it is the angle of the tables that is wrong. [SR-27] */
 static bool taken_away(const flux_residual_t *residual, const flux_residual_phase_t *phase) {
     const uint32_t age = residual->sample.periods - phase->zero_at;
     const bool was_small = phase->conducting > FLUX_RESIDUAL_FOLLOW_MS * residual->sample.periods_per_ms;
@@ -126,7 +127,7 @@ static bool taken_away(const flux_residual_t *residual, const flux_residual_phas
     return -(int64_t)phase->followed_q29 > phase->peak_q29 / 2 + drops_q29 + warm_q29;
 }
 
-/* A current that should not be: does it move? */
+/* A current that should not be: does it move? [SR-26] [SR-27] */
 static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t *state, unsigned index, bool excess,
                          flux_evidence_t *evidence) {
     const flux_residual_phase_t *phase = &residual->phase[index];
@@ -159,7 +160,7 @@ static void check_excess(const flux_residual_t *residual, phase_evidence_phase_t
 }
 
 /* There is no current while there is voltage, or it has ended within the last milliseconds before the voltage had
- * removed it. */
+ * removed it. [SR-25] */
 static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *state, unsigned index) {
     const flux_residual_phase_t *phase = &residual->phase[index];
     if (phase->none && phase->flux_q29 > fixed_add(phase->peak_q29 / 8, 2 * residual->delay_q29)) {
@@ -173,7 +174,7 @@ static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *
     return vanished || none;
 }
 
-/* A difference on one side over TURN_MIN is one that an angle may explain: judge_doubts. */
+/* A difference on one side over TURN_MIN is one that an angle may explain: judge_doubts. [SR-25] [SR-27] */
 static void follow_side(const flux_residual_t *residual, phase_evidence_t *state, unsigned index, int side) {
     phase_evidence_phase_t *phase_state = &state->phase[index];
     phase_state->turned = side == 0 || side != phase_state->side
@@ -187,13 +188,14 @@ static void follow_side(const flux_residual_t *residual, phase_evidence_t *state
     }
 }
 
-/* True when a phase has had less flux linkage than any angle explains in OPEN_SAMPLES samples in succession. */
+/* True when a phase has had less flux linkage than any angle explains in OPEN_SAMPLES samples in succession. [SR-25] */
 static bool stays_open(phase_evidence_phase_t *phase_state, bool too_little) {
     const unsigned samples = phase_state->open_samples + (phase_state->open_samples < OPEN_SAMPLES ? 1u : 0u);
     phase_state->open_samples = (uint8_t)(too_little ? samples : 0);
     return phase_state->open_samples >= OPEN_SAMPLES;
 }
 
+/* [SR-25] [SR-26] [SR-27] */
 static void check_phase(const flux_residual_t *residual, phase_evidence_t *state, unsigned index,
                         flux_evidence_t *evidence) {
     const bool is_lost = (residual->sample.lost_phases >> index & 1u) != 0;
@@ -221,7 +223,7 @@ static void check_phase(const flux_residual_t *residual, phase_evidence_t *state
  * DOUBT_MS, in which all others have conducted within the tolerances, and then has one again; else they decide nothing
  * here, and may be the encoder's. A wrong angle shows most in a stroke that begins in its middle, as the first one of a
  * run, and may be within the tolerances in complete ones; a fault of the phase shows in the next stroke, too.
- */
+ * [SR-25] [SR-27] */
 static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *state, flux_evidence_t *evidence) {
     if (state->doubted == 0) {
         state->doubted_at = residual->sample.periods;
@@ -253,6 +255,7 @@ static void judge_doubts(const flux_residual_t *residual, phase_evidence_t *stat
     }
 }
 
+/* [SR-29] */
 void phase_evidence_forget(phase_evidence_t *state) {
     state->doubted = 0;
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {
@@ -262,6 +265,7 @@ void phase_evidence_forget(phase_evidence_t *state) {
     }
 }
 
+/* [SR-25] [SR-26] [SR-27] */
 COLD void phase_evidence_step(phase_evidence_t *state, const flux_residual_t *residual, flux_evidence_t *evidence) {
     for (unsigned phase = 0; phase < residual->phases; phase++) {
         check_phase(residual, state, phase, evidence);

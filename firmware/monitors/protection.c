@@ -32,7 +32,7 @@ static void fail_if(uint32_t *failed, bool condition, fault_t fault) {
     }
 }
 
-/* Triggers lost in consecutive periods, including this one; saturates to 2^31 - 1. */
+/* Triggers lost in consecutive periods, including this one; saturates to 2^31 - 1. [SR-46] */
 static uint32_t count_overruns(protection_t *protection, uint32_t missed_interrupts) {
     uint32_t overruns = 0;
     if (missed_interrupts != 0) {
@@ -44,14 +44,14 @@ static uint32_t count_overruns(protection_t *protection, uint32_t missed_interru
 }
 
 /* True when the angle changed by more than the rotor can turn, over the lost periods as well. More lost periods are the
- * fault interrupt_overrun, and no other one follows from what the rotor did meanwhile. */
+ * fault interrupt_overrun, and no other one follows from what the rotor did meanwhile. [SR-19] */
 static bool encoder_jumped(const protection_parameters_t *parameters, int32_t angle_step, uint32_t missed_interrupts) {
     const uint32_t step_max = (uint32_t)parameters->angle_step_max;
     const uint32_t limit = step_max * missed_interrupts + step_max;
     return ((uint32_t)angle_step + limit > 2 * limit) & (missed_interrupts < PROTECTION_OVERRUNS_MAX);
 }
 
-/* The encoder has counted. Not inlined, which saves the longer path three instructions. */
+/* The encoder has counted. Not inlined, which saves the longer path three instructions. [SR-20] */
 NOINLINE static void count(protection_deferred_t *protection, uint32_t encoder_angle, int32_t speed_q22) {
     const int32_t before_q22 = protection->speed_counted_q22;
     protection->encoder_angle = encoder_angle;
@@ -65,7 +65,7 @@ NOINLINE static void count(protection_deferred_t *protection, uint32_t encoder_a
  * counts less the largest possible deceleration since; what the observer makes of a first count after rest is no speed.
  * The observer cannot tell: with a high bandwidth it follows a frozen encoder to standstill before the rotor has turned
  * far, and of a locked rotor it predicts motion. A rotor that leaves standstill meanwhile is found by its flux linkage
- * (encoder_monitor.h). Frozen until the encoder counts: at standstill nothing else shows whether it could. */
+ * (encoder_monitor.h). Frozen until the encoder counts: at standstill nothing else shows whether it could. [SR-20] */
 static bool encoder_frozen(const protection_parameters_t *parameters, protection_deferred_t *protection,
                            const protection_deferred_input_t *input) {
     if (input->encoder_angle != protection->encoder_angle) {
@@ -87,6 +87,7 @@ static bool encoder_frozen(const protection_parameters_t *parameters, protection
     return protection->frozen;
 }
 
+/* [SR-02] [SR-11] [SR-12] [SR-13] [SR-19] [SR-45] [SR-46] */
 uint64_t protection_check(const protection_parameters_t *parameters, protection_t *protection,
                           const protection_input_t *input) {
     const int32_t angle_step = (int32_t)(input->encoder_angle - protection->encoder_angle); /* modulo one revolution */
@@ -105,6 +106,7 @@ uint64_t protection_check(const protection_parameters_t *parameters, protection_
     return failed;
 }
 
+/* [SR-05] [SR-15] [SR-20] */
 uint64_t protection_check_deferred(const protection_parameters_t *parameters, protection_deferred_t *protection,
                                    const protection_deferred_input_t *input) {
     uint32_t failed = 0;

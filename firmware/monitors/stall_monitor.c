@@ -10,7 +10,7 @@
 
 #define ONE_REV_Q24 (1 << 24)
 
-/* Torque and speed of a stall. swings: the rotor has turned backwards a short time ago. */
+/* Torque and speed of a stall. swings: the rotor has turned backwards a short time ago. [SR-24] */
 static bool pushes_in_vain(const stall_input_t *input, bool swings) {
     const bool forward = input->speed_reference_q22 > 0;
     const int32_t limit_q24 = fixed_abs(forward ? input->torque_max_q24 : input->torque_min_q24);
@@ -19,7 +19,8 @@ static bool pushes_in_vain(const stall_input_t *input, bool swings) {
     return input->speed_mode && (slow || swings) && limit_q24 > 0 && torque_q24 >= limit_q24 - limit_q24 / 16;
 }
 
-/* Widens the range of the angles that the rotor has been at, of the last revolution, by at least half a stroke. */
+/* Widens the range of the angles that the rotor has been at, of the last revolution, by at least half a stroke.
+ * [SR-24] */
 static bool widens_range(stall_monitor_t *monitor) {
     const int32_t half_stroke_q24 = ONE_REV_Q24 / 2 / machine_tables.phases;
     int32_t ahead_q24 = monitor->ahead_q24, lowest_q24 = monitor->lowest_ahead_q24;
@@ -39,7 +40,7 @@ static bool widens_range(stall_monitor_t *monitor) {
 
 /* The rotor has come no further in either direction, nor turned backwards more slowly by change_q22, for STALL_SWING_US
  * and the time in which the reference turns by three strokes: r, of at most 4 f, and f have r f / (r + f), the speed of
- * three strokes in the sum of their times. Factors below 2^16. speed_q22: in the direction of the reference. */
+ * three strokes in the sum of their times. Factors below 2^16. speed_q22: in the direction of the reference. [SR-24] */
 static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *input, int32_t speed_q22,
                               int32_t change_q22, bool begins, uint32_t time_us) {
     const uint32_t strokes = (uint32_t)machine_tables.rotor_poles * machine_tables.phases;
@@ -62,12 +63,13 @@ static bool makes_no_progress(stall_monitor_t *monitor, const stall_input_t *inp
     return monitor->travel > (uint64_t)swing_q10 * STALL_SWING_US;
 }
 
+/* [SR-24] */
 COLD bool stall_monitor_failed(stall_monitor_t *monitor, const stall_input_t *input, uint32_t time_us) {
     const bool forward = input->speed_reference_q22 > 0; /* for a reference of 0 it has to be the same everywhere */
     const int32_t speed_q22 = forward ? input->speed_q22 : fixed_subtract(0, input->speed_q22);
     const int32_t change_q22 = fixed_abs(input->speed_reference_q22) / 128;
     const bool before = monitor->vain && monitor->forward == forward;
-    if ((input->speed_q22 ^ input->speed_reference_q22) < 0) {
+    if (speed_q22 < 0) {
         monitor->backwards_us = time_us;
     } else if (time_us - monitor->backwards_us > STALL_TIME_US) {
         monitor->backwards_us = time_us - STALL_TIME_US - 1u; /* its age does not wrap */

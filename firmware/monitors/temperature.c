@@ -14,6 +14,7 @@ static int32_t code(int32_t limit_C) {
     return (limit_C - HAL_ADC_TEMPERATURE_ZERO_C) * (1 << TEMPERATURE_CODE_BITS) / HAL_ADC_TEMPERATURE_SPAN_K;
 }
 
+/* [SR-17] */
 COLD temperature_parameters_t temperature_configure(const int32_t *values) {
     return (temperature_parameters_t){
         .limit = {code(values[PARAMETER_WINDING_LIMIT_C]), code(values[PARAMETER_INVERTER_LIMIT_C])},
@@ -21,6 +22,7 @@ COLD temperature_parameters_t temperature_configure(const int32_t *values) {
     };
 }
 
+/* [SR-18] */
 COLD void temperature_init(temperature_t *temperature, uint32_t time_us) {
     *temperature = (temperature_t){.step_us = time_us - TEMPERATURE_STEP_US, .torque_limit_q24 = INT32_MAX};
     for (unsigned sensor = 0; sensor < HAL_ADC_TEMPERATURES; sensor++) {
@@ -28,7 +30,7 @@ COLD void temperature_init(temperature_t *temperature, uint32_t time_us) {
     }
 }
 
-/* The highest valid reading of a part; not below the one before while a reading is not valid. */
+/* The highest valid reading of a part; not below the one before while a reading is not valid. [SR-17] [SR-18] */
 static int32_t read_part(temperature_t *temperature, const hal_t *hal, temperature_part_t part, unsigned phases) {
     const unsigned first = part == TEMPERATURE_WINDING ? HAL_ADC_WINDING : HAL_ADC_INVERTER;
     const int32_t before = temperature->hottest[part];
@@ -52,6 +54,7 @@ static int32_t read_part(temperature_t *temperature, const hal_t *hal, temperatu
     return hottest;
 }
 
+/* [SR-17] [SR-18] */
 COLD void temperature_step(const temperature_parameters_t *parameters, temperature_t *temperature, const hal_t *hal,
                            unsigned phases, uint32_t time_us) {
     if (time_us - temperature->step_us < TEMPERATURE_STEP_US) {
@@ -72,6 +75,7 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
     temperature->torque_limit_q24 = (int32_t)fixed_divide(part_of_max, DERATE_CODES);
 }
 
+/* [SR-17] [SR-18] */
 COLD uint32_t temperature_faults(const temperature_t *temperature) {
     const uint8_t *sensors = temperature->failed_sensors;
     const unsigned failed = sensors[TEMPERATURE_WINDING] | sensors[TEMPERATURE_INVERTER];

@@ -1,3 +1,4 @@
+/* [SR-16] */
 #include "monitors/thermal.h"
 
 #include "fixed/compiler.h"

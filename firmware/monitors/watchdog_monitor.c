@@ -5,6 +5,7 @@
 #define IN_ORDER                                                                                                       \
     (((uint32_t)WATCHDOG_CHECKED << WATCHDOG_PART_BITS | WATCHDOG_STORED) << WATCHDOG_PART_BITS | WATCHDOG_SERVED)
 
+/* [SR-47] */
 COLD bool watchdog_monitor_kick(watchdog_monitor_t *monitor, uint32_t periods, uint32_t requests, uint32_t completed,
                                 uint32_t time_us) {
     const uint32_t passed = monitor->passed;

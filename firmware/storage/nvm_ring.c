@@ -1,3 +1,4 @@
+/* [SR-59] */
 #include "storage/nvm_ring.h"
 
 #include "fixed/compiler.h"
@@ -24,7 +25,7 @@ static uint64_t checksum_word(uint32_t crc) {
     return (uint64_t)~crc << 32 | crc;
 }
 
-/* A committed record with a sequence number. */
+/* A committed record with a sequence number. [SR-58] [SR-59] */
 static bool valid(const nvm_ring_t *ring, const hal_t *hal, unsigned page, unsigned slot, uint32_t sequence) {
     const unsigned checked = ring->record_words - 2u;
     if (read_word(ring, hal, page, slot, 0) != header(ring, sequence) ||
@@ -55,7 +56,7 @@ static bool is_inside(const nvm_ring_t *ring) {
 
 /* The first erased place from the present one on, else the start of the page that does not have the newest record: of
  * the present page again, when every place of it was passed over before a record was committed. Without a record page 0
- * is kept, because what is damaged there tells the caller that there was one. */
+ * is kept, because what is damaged there tells the caller that there was one. [SR-58] */
 static void find_place(nvm_ring_t *ring, const hal_t *hal) {
     ring->word = 0;
     ring->crc = 0;
@@ -90,6 +91,7 @@ COLD void nvm_ring_init(nvm_ring_t *ring, const hal_t *hal, unsigned first_page,
     find_place(ring, hal);
 }
 
+/* [SR-58] [SR-60] */
 COLD bool nvm_ring_read(const nvm_ring_t *ring, const hal_t *hal, uint32_t sequence, uint64_t *payload) {
     for (unsigned page = 0; page < 2; page++) {
         for (unsigned slot = slots(ring); slot-- > 0;) {

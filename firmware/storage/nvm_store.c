@@ -22,6 +22,7 @@ static_assert(HAL_NVM_PAGE_WORDS / (FAULT_WORDS + NVM_RING_OVERHEAD) >= NVM_STOR
 static_assert(HAL_NVM_PAGE_WORDS / (PARAMETER_WORDS + NVM_RING_OVERHEAD) >= 2, "in one page");
 static_assert(FAULT_COUNT <= 32, "checks of an entry");
 
+/* [SR-57] [SR-58] */
 static uint64_t parameter_word(const nvm_store_t *store, const parameters_t *parameters, unsigned index) {
     if (index == 0) {
         return (uint64_t)PARAMETER_COUNT << 32 | store->identity;
@@ -36,7 +37,7 @@ static uint64_t parameter_word(const nvm_store_t *store, const parameters_t *par
     return (uint64_t)pair[1] << 32 | pair[0];
 }
 
-/* Loads the newest set; false when it is of another list or machine, or a value is out of range. */
+/* Loads the newest set; false when it is of another list or machine, or a value is out of range. [SR-58] */
 static bool load(const nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
     uint64_t payload[PARAMETER_WORDS];
     if (!nvm_ring_read(&store->parameters, hal, store->parameters.sequence, payload) ||
@@ -48,6 +49,7 @@ static bool load(const nvm_store_t *store, const hal_t *hal, parameters_t *param
     return parameters_restore(parameters, values);
 }
 
+/* [SR-58] */
 COLD void nvm_store_init(nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
     *store = (nvm_store_t){0};
     store->identity = crc32_continue(parameters_identity(), &machine_tables, sizeof machine_tables);
@@ -67,6 +69,7 @@ COLD void parameter_store_save(nvm_store_t *store) {
     store->saving = NVM_STORE_SAVING;
 }
 
+/* [SR-60] */
 COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *record) {
     if (record == NULL) {
         store->fault_seen = false;
@@ -101,6 +104,7 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
     memcpy(entry->current_q9, record->current_q9, sizeof entry->current_q9);
 }
 
+/* [SR-60] */
 static void write_fault(nvm_store_t *store, hal_t *hal) {
     uint64_t payload[FAULT_WORDS];
     memcpy(payload, &store->waiting[0], sizeof payload);
@@ -111,6 +115,7 @@ static void write_fault(nvm_store_t *store, hal_t *hal) {
     }
 }
 
+/* [SR-59] */
 static void write_parameters(nvm_store_t *store, hal_t *hal, const parameters_t *parameters) {
     nvm_ring_t *ring = &store->parameters;
     if (!parameters_intact(parameters)) {
@@ -133,6 +138,7 @@ static void write_parameters(nvm_store_t *store, hal_t *hal, const parameters_t 
     }
 }
 
+/* [SR-59] [SR-60] */
 COLD void nvm_store_step(nvm_store_t *store, hal_t *hal, const parameters_t *parameters, uint32_t time_us,
                          bool writable) {
     if (time_us < store->time_us && store->time_wraps < UINT16_MAX) {
@@ -151,6 +157,7 @@ COLD void nvm_store_step(nvm_store_t *store, hal_t *hal, const parameters_t *par
     }
 }
 
+/* [SR-60] */
 COLD bool nvm_store_read_fault(const nvm_store_t *store, const hal_t *hal, uint32_t sequence,
                                nvm_store_fault_t *fault) {
     const uint32_t newest = nvm_store_newest_fault(store);

@@ -41,6 +41,7 @@ static const char texts[] =
 
 static_assert((int)PARAMETER_COUNT <= MACHINE_PARAMETERS_MAX, "the machine's tables have a default of each parameter");
 
+/* [SR-57] */
 COLD uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]) {
     uint32_t sum = 0;
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
@@ -49,16 +50,18 @@ COLD uint32_t parameters_sum(const int32_t values[PARAMETER_COUNT]) {
     return sum;
 }
 
-/* Another one than 0 for memory that has been cleared. */
+/* Another one than 0 for memory that has been cleared. [SR-57] */
 static uint32_t sum_of(const parameters_t *parameters) {
     return ~(parameters_sum(parameters->values) + (uint32_t)parameters->controller_default +
              parameters->control_rate_hz);
 }
 
+/* [SR-57] */
 bool parameters_intact(const parameters_t *parameters) {
     return parameters->sum == sum_of(parameters);
 }
 
+/* [SR-57] */
 void parameters_init(parameters_t *parameters) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         parameters->values[i] = machine_tables.parameter_default[i];
@@ -89,6 +92,7 @@ const char *parameters_unit(unsigned index) {
     return text_after(2 * index + 1);
 }
 
+/* [SR-57] */
 void parameters_set(parameters_t *parameters, unsigned index, int32_t value) {
     parameters->values[index] = fixed_clamp(value, rows[index].minimum, rows[index].maximum);
     parameters->sum = sum_of(parameters);
@@ -118,6 +122,7 @@ static bool in_range(const int32_t values[PARAMETER_COUNT], unsigned index) {
     return values[index] >= rows[index].minimum && values[index] <= rows[index].maximum;
 }
 
+/* [SR-56] */
 static parameters_verdict_t check_each(const int32_t values[PARAMETER_COUNT], uint64_t written, bool running) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         if (!in_range(values, i)) {
@@ -145,6 +150,7 @@ static const struct {
     {PARAMETER_POSITION_MIN_REV, PARAMETER_POSITION_MAX_REV, true},
 };
 
+/* [SR-56] */
 static parameters_verdict_t check_orders(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {
     for (unsigned i = 0; i < sizeof orders / sizeof orders[0]; i++) {
         const unsigned low = orders[i].low;
@@ -169,7 +175,7 @@ static bool same(const parameters_t *present, const int32_t values[PARAMETER_COU
     return values[index] == present->values[index];
 }
 
-/* Angles of turn-on and turn-off that are new. */
+/* Angles of turn-on and turn-off that are new. [SR-56] */
 static parameters_verdict_t check_direction(const parameters_t *present, const int32_t values[PARAMETER_COUNT]) {
     const bool kept = same(present, values, PARAMETER_TURN_ON_ANGLE_DEG) &&
                       same(present, values, PARAMETER_TURN_OFF_ANGLE_DEG) &&
@@ -184,7 +190,7 @@ static parameters_verdict_t check_direction(const parameters_t *present, const i
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }
 
-/* Nothing can be said about a drive without its supply. */
+/* Nothing can be said about a drive without its supply. [SR-56] */
 static parameters_verdict_t check_supply(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                          int32_t voltage_q6) {
     const bool supplied = voltage_q6 >= present->values[PARAMETER_UNDER_VOLTAGE_V] &&
@@ -198,6 +204,7 @@ static parameters_verdict_t check_supply(const parameters_t *present, const int3
     return (parameters_verdict_t){PARAMETER_STATUS_DONE, 0, 0};
 }
 
+/* [SR-56] */
 parameters_verdict_t parameters_check(const parameters_t *present, const int32_t values[PARAMETER_COUNT],
                                       uint64_t written, const parameters_conditions_t *conditions) {
     parameters_verdict_t verdict = check_each(values, written, conditions->running);
@@ -213,12 +220,14 @@ parameters_verdict_t parameters_check(const parameters_t *present, const int32_t
     return verdict;
 }
 
+/* [SR-56] */
 void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
     memcpy(parameters->values, values, sizeof parameters->values);
     parameters->sum = sum_of(parameters);
     parameters->revision++;
 }
 
+/* [SR-58] */
 bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         if (!in_range(values, i)) {

@@ -5,7 +5,7 @@
  *                 transfers, which write BG into EGR of both timers: at the start of the period, as the contract has it
  *   STO, faults   one line for both timers' BRK, low unless both STO lines and the drivers' fault line are high; which
  *                 of them fell is kept by the edge detectors of EXTI, however short the pulse
- */
+ * [SR-01] [SR-10] [SR-45] */
 #include "hal_pwm.h"
 #include "stm32g4/board.h"
 #include "stm32g4/pins.h"

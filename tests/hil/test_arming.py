@@ -1,4 +1,4 @@
-"""Arming in two steps over the bus: what arms a drive, and the recordings and second senders that do not."""
+"""Arming in two steps over the bus: what arms a drive, and the recordings and second senders that do not. [SR-34]"""
 
 from __future__ import annotations
 
@@ -111,6 +111,7 @@ def test_one_frame_after_a_silence_does_not_start_it(bench):
     expect_standstill(bench, 0.1)
 
 
+# [SR-35] [SR-42]
 def test_drive_that_a_fault_has_disarmed_waits_for_a_new_request(bench):
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.1)
@@ -135,6 +136,7 @@ def test_drive_that_a_fault_has_disarmed_waits_for_a_new_request(bench):
 SECOND_SENDERS = {"1 kHz": 0.001, "the same rate": 0.01, "slower": 0.07}
 
 
+# [SR-36]
 @pytest.mark.parametrize("period_s", SECOND_SENDERS.values(), ids=SECOND_SENDERS)
 @pytest.mark.parametrize("frame", [command_frame, torque_command_frame], ids=["speed", "torque"])
 def test_second_sender_ends_the_run_and_does_not_take_over(bench, period_s, frame):
@@ -153,6 +155,7 @@ def test_second_sender_ends_the_run_and_does_not_take_over(bench, period_s, fram
     assert 550 < motion.value.min() <= motion.value.max() < 605
 
 
+# [SR-36]
 def test_three_recorded_frames_beside_the_living_sender_end_the_run(bench):
     bench.drive.speed_reference_rpm = -900
     bench.run_for(0.2)
@@ -169,6 +172,7 @@ def test_three_recorded_frames_beside_the_living_sender_end_the_run(bench):
     assert bench.truth["speed_rpm"].between(begin_s, bench.time_s).value.min() > 500
 
 
+# [SR-04] [SR-05]
 def test_torque_ramps_to_zero_without_commands_and_the_gates_open_after_half_a_second(bench):
     bench.rig.held_speed_rpm = 300
     bench.drive.torque_reference_Nm = 8
@@ -187,6 +191,7 @@ def test_torque_ramps_to_zero_without_commands_and_the_gates_open_after_half_a_s
     assert bench.telemetry["DRIVE_FAULT_CAUSE.time_us"].last / 1e6 - last_s == pytest.approx(0.5, abs=0.0005)
 
 
+# [SR-04] [SR-05]
 @pytest.mark.parametrize("reference_rpm", [450, -450])
 def test_silence_during_an_acceleration_does_not_carry_the_speed_beyond_its_reference(make_bench, reference_rpm):
     bench = make_bench(controller="salient")
@@ -198,6 +203,7 @@ def test_silence_during_an_acceleration_does_not_carry_the_speed_beyond_its_refe
     assert 1.0 < abs(bench.truth["speed_rpm"].value).max() / abs(reference_rpm) < 1.15
 
 
+# [SR-04] [SR-05]
 @pytest.mark.parametrize(("pause_s", "fault"),
                          [(0.04, "none"), (0.2, "none"), (0.45, "none"), (0.52, "command_timeout")])
 def test_run_goes_on_when_commands_come_back_within_half_a_second(bench, pause_s, fault):

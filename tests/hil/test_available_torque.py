@@ -24,6 +24,7 @@ def peak_Nm(machine: str = "saturating") -> float:
     return derive(load_machine(ROOT / f"tools/machines/{machine}.toml")).torque_peak_Nm
 
 
+# [SR-09]
 @pytest.mark.parametrize("machine", ["saturating", "finite_element"])
 def test_at_low_speed_both_directions_have_the_torque_of_the_current_limit(make_bench, machine):
     bench = make_bench(machine=machine, controller="salient")
@@ -35,6 +36,7 @@ def test_at_low_speed_both_directions_have_the_torque_of_the_current_limit(make_
     assert bench.telemetry[f"{AVAILABLE}load_exceeds"].last == 0
 
 
+# [SR-09]
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_a_controller_of_one_quadrant_has_no_torque_backwards(make_bench, controller):
     bench = make_bench(controller=controller)
@@ -45,6 +47,7 @@ def test_a_controller_of_one_quadrant_has_no_torque_backwards(make_bench, contro
     assert limited_by(bench, "forward") == "current"
 
 
+# [SR-09]
 @pytest.mark.parametrize("sign", [1, -1])
 def test_far_above_base_speed_the_voltage_limits_the_torque_that_drives(make_bench, sign):
     bench = make_bench(machine="linear_cosine", controller="salient")
@@ -58,6 +61,7 @@ def test_far_above_base_speed_the_voltage_limits_the_torque_that_drives(make_ben
     assert sign * available_Nm(bench, side) < 0.99 * peak_Nm("linear_cosine")
 
 
+# [SR-09]
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_load_that_drives_into_a_full_link_is_told_before_over_speed(make_bench, sign):
     """Without a chopper: the load feeds the link until it takes the losses of the windings only."""
@@ -79,6 +83,7 @@ def test_a_load_that_drives_into_a_full_link_is_told_before_over_speed(make_benc
     assert {limit for _, limit in told} == {"dc_link"}
 
 
+# [SR-09]
 def test_a_load_that_the_torque_holds_is_not_told(make_bench):
     bench = make_bench(controller="salient")
     bench.drive.speed_reference_rpm = 150
@@ -89,6 +94,7 @@ def test_a_load_that_the_torque_holds_is_not_told(make_bench):
     assert set(bench.telemetry[f"{AVAILABLE}load_exceeds"].value) == {0}
 
 
+# [SR-09]
 def test_heat_is_named_when_it_takes_torque(make_bench):
     bench = make_bench(controller="salient")
     bench.drive.parameters["winding_time_constant_s"] = 1
@@ -103,6 +109,7 @@ def test_heat_is_named_when_it_takes_torque(make_bench):
     assert limit_Nm < 0.95 * peak_Nm()
 
 
+# [SR-09]
 def test_a_lost_phase_is_named_with_the_mean_torque_of_the_others(make_bench):
     bench = make_bench(controller="salient")
     bench.drive.parameters["degraded_running"] = 1

@@ -1,4 +1,6 @@
-"""A drive on a bus with faults: babbling node, bus-off, lost acknowledgement, second sender of its identifiers."""
+"""A drive on a bus with faults: babbling node, bus-off, lost acknowledgement, second sender of its identifiers.
+[SR-38]
+"""
 
 from __future__ import annotations
 
@@ -33,6 +35,7 @@ def running(bench, speed_rpm: float = 600.0):
     return bench
 
 
+# [SR-05]
 def test_control_is_bit_identical_under_a_babbling_node_of_identifier_0_until_the_command_times_out(
         make_bench, tmp_path):
     def silence(bench):
@@ -56,6 +59,7 @@ def test_control_is_bit_identical_under_a_babbling_node_of_identifier_0_until_th
     assert np.array_equal(babbled, recorded("silent", silence))
 
 
+# [SR-05]
 @pytest.mark.parametrize("length", [0, 8])
 def test_babbling_node_of_identifier_0_at_full_load_lets_commands_time_out_and_counters_agree(bench, length):
     running(bench)
@@ -82,6 +86,7 @@ def test_babbling_node_of_identifier_0_at_full_load_lets_commands_time_out_and_c
     assert bench.telemetry["foreign_identifier_count"].last == 0
 
 
+# [SR-32]
 @pytest.mark.both_transports
 def test_frames_of_a_babbling_node_are_in_the_log_at_their_times(bench):
     bench.drive.off()
@@ -95,6 +100,7 @@ def test_frames_of_a_babbling_node_are_in_the_log_at_their_times(bench):
     assert {after - before for before, after in itertools.pairwise(times)} == {53_000}
 
 
+# [SR-32]
 def test_heartbeat_and_commands_pass_a_babbling_node_of_the_lowest_priority(bench):
     running(bench)
     bench.rig.babble_identifier = 0x7FF
@@ -161,6 +167,7 @@ def test_run_request_that_continues_through_bus_off_is_not_taken_up_again(bench)
     assert bench.drive.state == "ready"
 
 
+# [SR-05] [SR-38]
 def test_lost_acknowledgement_is_error_passive_never_bus_off_and_the_command_times_out(bench):
     running(bench)
     bench.rig.bus_connection = 0
@@ -190,6 +197,7 @@ def test_error_passive_and_the_counter_are_reported(bench):
     assert bus_state(bench) == ("error_active", 0, 0)
 
 
+# [SR-37]
 def test_second_sender_of_a_telemetry_identifier_is_a_fault_that_outlasts_it_by_a_second(bench):
     running(bench)
     with open_bus(bench.address) as other:
@@ -210,6 +218,7 @@ def test_second_sender_of_a_telemetry_identifier_is_a_fault_that_outlasts_it_by_
     assert bench.telemetry["foreign_identifier_count"].last == 1
 
 
+# [SR-37]
 def test_babbling_second_sender_collides_and_both_counters_climb(bench):
     """Whenever both transmit the identifier at once, the data differ: bit errors, up to bus-off."""
     running(bench)
@@ -223,6 +232,7 @@ def test_babbling_second_sender_collides_and_both_counters_climb(bench):
     assert bench.telemetry["foreign_identifier_count"].last > 1000
 
 
+# [SR-32]
 @pytest.mark.parametrize(("fault", "sender"), [("lost", "others"), ("corrupted", "all"), ("delayed", "all"),
                                            ("duplicated", "all")])
 def test_drive_runs_on_while_one_frame_in_ten_is_disturbed(bench, fault, sender):
@@ -248,6 +258,7 @@ def test_drive_runs_on_while_one_frame_in_ten_is_disturbed(bench, fault, sender)
         assert bench.telemetry["bus_off_count"].last == 0
 
 
+# [SR-32]
 def test_equal_seeds_disturb_equal_frames(make_bench):
     def counters(seed):
         bench = make_bench(seed=seed)

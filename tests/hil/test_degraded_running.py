@@ -1,4 +1,4 @@
-"""Degraded running: with one phase lost the drive goes on with the others, if it may."""
+"""Degraded running: with one phase lost the drive goes on with the others, if it may. [SR-31]"""
 
 from __future__ import annotations
 
@@ -56,6 +56,7 @@ def test_lost_phase_under_load_leaves_the_speed_at_its_reference(make_bench, mac
     assert not current_b(bench, begin_s + STROKES_S).any()
 
 
+# [SR-09] [SR-31]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("machine", ["saturating", "finite_element"])
 def test_reported_torque_is_what_the_other_phases_make(make_bench, machine, controller):
@@ -186,6 +187,7 @@ def test_phase_is_given_back_outside_a_run_when_the_parameter_no_longer_allows_i
     assert (bench.drive.state, bench.drive.fault) == ("fault", "phase_open")
 
 
+# [SR-09] [SR-31]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_start_where_only_the_lost_phase_has_torque_is_a_stall_and_stated_before(make_bench, controller):
     bench = make_bench(controller=controller, initial_angle_deg=DEAD_ZONE_DEG)

@@ -1,6 +1,7 @@
 """Encoder faults at standstill and at speed: fault, time, motion and true current, bounded on both sides; and none of a
 healthy encoder. Lower bounds are physics: the flux linkage that contradicts the encoder appears with motion, and the
-torque limit turns the inertia by an angle in sqrt(2 angle J / T) at least."""
+torque limit turns the inertia by an angle in sqrt(2 angle J / T) at least. [SR-22]
+"""
 
 from __future__ import annotations
 
@@ -44,6 +45,7 @@ def run_until_fault(bench: Bench, timeout_s: float) -> None:
 # --- Frozen before the start ---
 
 
+# [SR-21]
 @pytest.mark.parametrize("initial_angle_deg", [0.0, 10.0, 22.0])
 @pytest.mark.parametrize("speed_rpm", [10, 1500])
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -66,6 +68,7 @@ def test_encoder_frozen_before_the_start_is_a_fault_before_the_rotor_has_turned_
     assert least_s < fault_s(bench) - started_s < 0.03
 
 
+# [SR-21]
 @pytest.mark.parametrize("load_Nm", [6.0, 12.0])
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_encoder_frozen_before_a_start_against_static_friction_is_found_once_the_rotor_moves(make_bench, controller,
@@ -80,6 +83,7 @@ def test_encoder_frozen_before_a_start_against_static_friction_is_found_once_the
     assert 0.2 < motion_deg(bench, 0.0, fault_s(bench)) < 5.0
 
 
+# [SR-21]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("machine", ["saturating", "finite_element"])
 def test_locked_shaft_is_a_stall_and_no_fault_of_the_encoder(make_bench, machine, controller):
@@ -119,6 +123,7 @@ CASES = {
 }
 
 
+# [SR-19] [SR-20] [SR-22]
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_fault_of_the_encoder_at_speed_is_the_first_cause_within_its_time(make_bench, controller, name):
@@ -181,6 +186,7 @@ def test_encoder_reversed_before_the_start_is_a_fault_within_half_a_pole_pitch(m
 # --- Clearing ---
 
 
+# [SR-20] [SR-41]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_frozen_encoder_is_not_cleared_before_it_counts_again(make_bench, controller):
     bench = make_bench(controller=controller)
@@ -199,6 +205,7 @@ def test_frozen_encoder_is_not_cleared_before_it_counts_again(make_bench, contro
     assert bench.drive.state == "ready"
 
 
+# [SR-20] [SR-41]
 def test_encoder_that_was_frozen_at_standstill_is_cleared_once_the_shaft_has_been_turned(make_bench):
     bench = make_bench(initial_angle_deg=10.0)
     fault = bench.fault("encoder_stuck")
@@ -218,6 +225,7 @@ def test_encoder_that_was_frozen_at_standstill_is_cleared_once_the_shaft_has_bee
     assert bench.drive.state == "ready"
 
 
+# [SR-41]
 def test_fault_whose_cause_is_gone_for_less_than_10_ms_is_cleared_only_then(bench):
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.1)
@@ -230,6 +238,7 @@ def test_fault_whose_cause_is_gone_for_less_than_10_ms_is_cleared_only_then(benc
     assert 0.008 < bench.time_s - begin_s < 0.0115
 
 
+# [SR-41]
 def test_clear_fault_in_run_is_refused_and_counted(bench):
     bench.drive.speed_reference_rpm = 600
     bench.run_for(0.15)
@@ -245,6 +254,7 @@ def test_clear_fault_in_run_is_refused_and_counted(bench):
 # --- Healthy encoders ---
 
 
+# [SR-30]
 @pytest.mark.in_turns
 @pytest.mark.parametrize(("machine", "controller", "ahead_deg", "flux_linkage_gain", "speed_rpm"), [
     ("linear_cosine", "paper", 2.0, 0.9, 600),
@@ -281,6 +291,7 @@ SPECIFIED = {"current_sensor_gain": 1.05, "current_sensor_offset_A": 0.5, "curre
              "resistance_gain": 1.4, "current_sensor_delay_us": 3.0, "supply_voltage_V": 220.0}
 
 
+# [SR-30]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("errors", [{}, SPECIFIED], ids=["ideal", "specified_errors"])
 @pytest.mark.parametrize(("machine", "controller", "bits", "edges", "speed_rpm", "load_Nm"), HEALTHY)

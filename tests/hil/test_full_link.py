@@ -21,6 +21,7 @@ def running(bench: Bench, speed_rpm: float) -> None:
     bench.rig.truth_period_us = 250
 
 
+# [SR-14]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("inertia", [0.3, 1.0, 4.0])
 @pytest.mark.parametrize("speed_rpm", [600, 1500, 2500, -1500])
@@ -39,6 +40,7 @@ def test_braking_without_a_chopper_stays_below_the_trip(make_bench, inertia, spe
     assert bench.truth["speed_rpm"].last / speed_rpm < 0.995, "friction and losses brake"
 
 
+# [SR-14]
 @pytest.mark.parametrize(("speed_rpm", "torque_Nm"), [(1500, -4), (1500, -16), (-1500, 16)])
 def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, speed_rpm, torque_Nm):
     """The dynamometer holds the speed, so that the energy does not end."""
@@ -54,6 +56,7 @@ def test_a_commanded_braking_torque_falls_as_the_link_fills(make_bench, speed_rp
     assert bench.telemetry["torque_reference_Nm"].last / torque_Nm < 0.75
 
 
+# [SR-14]
 @pytest.mark.parametrize("supply_V", [265, 290])
 def test_a_supply_that_rises_while_the_drive_brakes_is_no_trip(make_bench, supply_V):
     bench = make_bench(machine="finite_element", controller="salient")
@@ -65,6 +68,7 @@ def test_a_supply_that_rises_while_the_drive_brakes_is_no_trip(make_bench, suppl
     assert supply_V - 1 < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < 0.999 * OVER_VOLTAGE_V
 
 
+# [SR-14]
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_single_quadrant_controllers_regenerate_only_what_their_fields_hold(make_bench, controller):
     bench = make_bench(machine="finite_element", controller=controller)
@@ -75,6 +79,7 @@ def test_single_quadrant_controllers_regenerate_only_what_their_fields_hold(make
     assert 239 < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < 250
 
 
+# [SR-14]
 def test_a_chopper_that_opens_while_it_conducts_takes_no_more(make_bench):
     bench = make_bench(machine="finite_element", controller="traditional")
     bench.rig.truth_period_us = 250
@@ -90,6 +95,7 @@ def test_a_chopper_that_opens_while_it_conducts_takes_no_more(make_bench):
     assert voltage_V == pytest.approx(conducting_V, abs=0.1)
 
 
+# [SR-14]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("chopper_ohm", [12.0, 16.0, 24.0, None])
 @pytest.mark.parametrize("speed_rpm", [2250, 3000])
@@ -113,6 +119,7 @@ def test_the_largest_braking_torque_of_the_current_limit_at_once_is_no_trip(
     assert 0.96 * OVER_VOLTAGE_V < max(bench.truth["RIG_TRUTH_BENCH.bus_voltage_V"].value) < OVER_VOLTAGE_V
 
 
+# [SR-14]
 def test_windings_dissipate_what_the_chopper_does_not_take(make_bench):
     """At twice the base speed; 290 V at 12 ohm are 22.3 N m, and pulses of the least current lose 1.5 N m."""
     bench = make_bench(machine="finite_element", controller="salient")
@@ -131,6 +138,7 @@ def test_windings_dissipate_what_the_chopper_does_not_take(make_bench):
     assert 288 < np.min(voltage_V) < np.max(voltage_V) < 293, "it is steady"
 
 
+# [SR-14]
 @pytest.mark.parametrize("references_rpm", [(-300,), (300, 0, -300), (-300, 0, 300)])
 def test_a_full_link_leaves_a_drive_at_rest_the_torque_to_start_in_either_direction(make_bench, references_rpm):
     bench = make_bench(controller="salient")

@@ -1,4 +1,6 @@
-"""Openings of the switches without the firmware: comparators, safe torque off, compare values that are not renewed."""
+"""Openings of the switches without the firmware: comparators, safe torque off, compare values that are not renewed.
+[SR-01]
+"""
 
 from __future__ import annotations
 
@@ -34,6 +36,7 @@ def fall_together(currents: list[float]) -> bool:
     return all(later < earlier or later == 0 for earlier, later in pairwise(currents))
 
 
+# [SR-10]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("controller", ["traditional", "paper", "salient"])
 @pytest.mark.parametrize("gain", [0.0, 0.3])
@@ -70,6 +73,7 @@ def test_either_line_of_safe_torque_off_opens_the_switches_at_once(bench, line, 
     assert bench.telemetry[f"DRIVE_GATES.{line}"].last_name == "torque_off"
 
 
+# [SR-01] [SR-02]
 @pytest.mark.in_turns
 def test_safe_torque_off_is_reported_within_a_period_and_is_cleared_only_when_both_lines_are_energised(bench):
     running(bench)
@@ -96,6 +100,7 @@ def test_safe_torque_off_is_reported_within_a_period_and_is_cleared_only_when_bo
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
+# [SR-03]
 def test_lines_that_differ_for_200_ms_are_a_fault_until_both_have_been_off(bench):
     bench.run_for(0.01)
     assert bench.drive.state == "ready"
@@ -119,6 +124,7 @@ def test_lines_that_differ_for_200_ms_are_a_fault_until_both_have_been_off(bench
     assert bench.drive.state == "ready"
 
 
+# [SR-45]
 @pytest.mark.parametrize("controller", ["traditional", "salient"])
 @pytest.mark.parametrize("control_rate_hz", [20000, 40000, 100000])
 def test_interrupt_that_does_not_end_leaves_no_switch_on_after_two_periods(make_bench, controller, control_rate_hz):

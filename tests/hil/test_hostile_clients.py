@@ -1,4 +1,6 @@
-"""Invalid frames from other nodes increment their counters and change nothing else: the motion is bit-identical."""
+"""Invalid frames from other nodes increment their counters and change nothing else: the motion is bit-identical.
+[SR-32]
+"""
 
 from __future__ import annotations
 
@@ -93,6 +95,7 @@ def test_invalid_frames_are_counted_and_change_nothing(make_bench, tmp_path, und
     assert counters == dict.fromkeys(COUNTERS, 0.0) | {attack.split()[0]: len(ATTACKS[attack])}
 
 
+# [SR-33]
 @pytest.mark.parametrize("frames", [BITS_CHANGED[:4], [changed(GOOD, data=b"")] * 4,
                                     [command(3000.0), command(3000.0), command(-3000.0, 9), command(100.0, 120)]],
                          ids=["wrong_checksum", "wrong_length", "wrong_counter"])

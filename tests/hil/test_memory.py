@@ -100,6 +100,7 @@ def provoke(bench) -> None:
     bench.run_for(0.05)
 
 
+# [SR-60]
 def test_fault_log_has_the_snapshot_of_each_fault_and_survives_a_reset(bench):
     assert list(bench.drive.fault_log) == []
     provoke(bench)
@@ -120,6 +121,7 @@ def test_fault_log_has_the_snapshot_of_each_fault_and_survives_a_reset(bench):
     assert (second.number, second.start, second.fault) == (2, 2, "over_voltage")
 
 
+# [SR-60]
 def test_fault_log_has_the_last_16_faults(bench):
     bench.drive.wait_until_ready()
     for _ in range(18):
@@ -134,6 +136,7 @@ def test_fault_log_has_the_last_16_faults(bench):
     assert all(a.time_s < b.time_s for a, b in itertools.pairwise(log))
 
 
+# [SR-59]
 def test_power_cut_while_saving_leaves_the_old_set_or_the_new_one(bench):
     bench.rig.truth_period_us = 0
     parameters = bench.drive.parameters
@@ -192,6 +195,7 @@ def test_memory_file_is_kept_from_one_drive_to_the_next(make_bench, tmp_path):
     assert third.drive.state == "ready" and third.drive.start_inhibited_by == "none"
 
 
+# [SR-58]
 def test_set_of_another_machine_is_not_loaded(make_bench, tmp_path):
     file = tmp_path / "memory.bin"
     first = make_bench(memory=file)

@@ -142,6 +142,7 @@ def send_set(bench, frames: list[can.Message]) -> dict[str, object]:
     return responses(bench, begin_s)[-1]
 
 
+# [SR-56]
 @pytest.mark.both_transports
 def test_sequence_in_raw_frames_applies_a_set(bench):
     """The sequence of the CAN page."""
@@ -153,6 +154,7 @@ def test_sequence_in_raw_frames_applies_a_set(bench):
     assert (parameters["current_limit_A"], parameters["current_trip_A"]) == (40.0, 60.0)
 
 
+# [SR-56]
 def test_unprotected_frames_change_nothing(bench):
     before = values(bench)
     statuses = set()
@@ -171,6 +173,7 @@ def test_unprotected_frames_change_nothing(bench):
     assert bench.drive.parameters.origin == "defaults"
 
 
+# [SR-56]
 def test_protected_frames_without_being_armed_change_nothing(bench):
     before = values(bench)
     bench.run_for(0.2)
@@ -182,6 +185,7 @@ def test_protected_frames_without_being_armed_change_nothing(bench):
     assert bench.telemetry["DRIVE_ARMING.refused"].last == refused + len(TRIPS) + 2
 
 
+# [SR-56]
 @pytest.mark.bench_options(telemetry_period_ms=4)
 def test_recording_of_a_set_does_not_apply_again(bench, make_bench):
     bench.drive.parameters.update(TRIPS)
@@ -219,6 +223,7 @@ CONTRADICTIONS = {
 }
 
 
+# [SR-56]
 @pytest.mark.parametrize("case", CONTRADICTIONS)
 def test_contradiction_is_refused_with_both_names_and_nothing_of_the_set_is_applied(bench, case):
     wanted, message = CONTRADICTIONS[case]
@@ -238,6 +243,7 @@ def test_contradicting_values_in_one_set_that_agrees_are_applied_in_any_order(be
     assert parameters["current_trip_A"] == 20
 
 
+# [SR-56]
 @pytest.mark.parametrize("kind", ["missing", "damaged", "repeated", "out of sequence", "index"])
 def test_set_with_a_bad_frame_is_refused_and_the_frame_counted(bench, kind: str):
     before = values(bench)
@@ -268,6 +274,7 @@ def test_set_with_a_bad_frame_is_refused_and_the_frame_counted(bench, kind: str)
     assert values(bench) == (before | TRIPS if status == "done" else before)
 
 
+# [SR-56]
 def test_abandoned_set_and_one_without_frames_for_two_seconds_are_not_applied(bench):
     before = values(bench)
     *staged, apply = set_frames(9, raw(bench, TRIPS))
@@ -284,6 +291,7 @@ def test_abandoned_set_and_one_without_frames_for_two_seconds_are_not_applied(be
     assert values(bench) == before
 
 
+# [SR-56]
 def test_set_that_was_staged_before_a_run_is_not_applied_in_it(bench):
     before = values(bench)
     *staged, apply = set_frames(9, raw(bench, {"smc_k": 500.0}))
@@ -346,6 +354,7 @@ def test_tuned_gain_acts_in_the_same_run(make_bench):
     assert 4 * drops[0] < drops[1] < 100
 
 
+# [SR-56]
 def test_set_with_one_parameter_that_cannot_change_in_a_run_changes_none_there(bench):
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.05)

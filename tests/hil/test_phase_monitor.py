@@ -2,7 +2,7 @@
 
 Lower bounds are the voltage's: a fault of a phase shows in the flux linkage that the voltage builds up, and the
 tolerance of one period and 20 us takes full voltage for 45 us at 40 kHz. A phase conducts once in an electrical
-revolution, 25 ms at 600 r/min, which is the upper bound unless a cell has its own.
+revolution, 25 ms at 600 r/min, which is the upper bound unless a cell has its own. [SR-25] [SR-26] [SR-27]
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ def test_fault_of_a_phase_is_named_within_its_time(make_bench, name, controller)
         assert failed == {"b"} or cell.kind == "current_sensor_swapped"
 
 
+# [SR-28]
 @pytest.mark.parametrize("gain", [0.6, 2.0])
 @pytest.mark.parametrize("machine", ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"])
 def test_wrong_gain_is_found_by_the_balance_of_the_phases(make_bench, machine, gain):
@@ -100,6 +101,7 @@ def test_wrong_gain_is_found_by_the_balance_of_the_phases(make_bench, machine, g
     assert [phase for phase in "abcd" if bench.telemetry[f"DRIVE_PHASE_FAULT.phase_{phase}"].last] == ["b"]
 
 
+# [SR-25]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_dead_sensors_at_a_start_are_found_in_eight_periods_of_voltage(make_bench, controller):
     """At standstill, whichever phases are turned on; the tolerance is 45 us of full voltage and the flux linkage of
@@ -118,6 +120,7 @@ def test_dead_sensors_at_a_start_are_found_in_eight_periods_of_voltage(make_benc
     assert max(one.value.max() for one in currents) < 90.0
 
 
+# [SR-26] [SR-43]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_an_offset_keeps_the_drive_from_starting(make_bench, controller):
     bench = make_bench(controller=controller)
@@ -130,6 +133,7 @@ def test_an_offset_keeps_the_drive_from_starting(make_bench, controller):
     assert bench.truth["RIG_TRUTH_MOTION.speed_rpm"].value.max() == 0.0
 
 
+# [SR-41]
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_a_phase_that_is_whole_again_runs_after_clearing(make_bench, controller):
     bench = loaded(make_bench, controller)
@@ -146,6 +150,7 @@ def test_a_phase_that_is_whole_again_runs_after_clearing(make_bench, controller)
     assert bench.truth["RIG_TRUTH_MOTION.speed_rpm"].last == pytest.approx(SPEED_RPM, abs=6.0)
 
 
+# [SR-30]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("controller", CONTROLLERS)

@@ -1,5 +1,6 @@
 """Every protection, provoked on the test bench and observed through CAN: fault, reaction time and record; all switches
-open, and the drive restarts only on command, without the cause, after the run request was withdrawn."""
+open, and the drive restarts only on command, without the cause, after the run request was withdrawn. [SR-39]
+"""
 
 from __future__ import annotations
 
@@ -61,6 +62,7 @@ def currents_A(bench: Bench) -> list[float]:
     return [bench.truth[f"RIG_TRUTH_CURRENTS.current_{phase}_A"].last for phase in "abc"]
 
 
+# [SR-11] [SR-12] [SR-13] [SR-15] [SR-39] [SR-40]
 @pytest.mark.parametrize("name", CASES)
 def test_fault_opens_all_switches_and_is_recorded_by_a_deferred_check_one_period_later(bench, name):
     case = CASES[name]
@@ -86,6 +88,7 @@ def test_fault_opens_all_switches_and_is_recorded_by_a_deferred_check_one_period
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-41]
 @pytest.mark.parametrize("name", CASES)
 def test_fault_is_cleared_on_command_only_after_its_cause_is_gone(bench, name):
     case = CASES[name]
@@ -114,6 +117,7 @@ def test_fault_is_cleared_on_command_only_after_its_cause_is_gone(bench, name):
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
+# [SR-42]
 def test_run_request_held_through_a_fault_must_be_withdrawn_first(bench):
     running(bench)
     bench.rig.supply_voltage_V = 320
@@ -124,6 +128,7 @@ def test_run_request_held_through_a_fault_must_be_withdrawn_first(bench):
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-07]
 @pytest.mark.parametrize("direction", [1, -1])
 def test_driving_load_trips_over_speed_in_either_direction(bench, direction):
     bench.drive.parameters["over_speed_rpm"] = 700
@@ -141,6 +146,7 @@ def test_driving_load_trips_over_speed_in_either_direction(bench, direction):
     assert bench.truth["speed_rpm"].last == pytest.approx(703 * direction, abs=8)
 
 
+# [SR-19] [SR-20]
 @pytest.mark.parametrize(("fault", "reaction_us"), [(1, (50, 1000)), (2, (0, 2 * PERIOD_US))])
 @pytest.mark.parametrize("direction", [1, -1])
 def test_frozen_or_jumping_encoder_is_detected_in_either_direction(bench, direction, fault, reaction_us):
@@ -158,6 +164,7 @@ def test_frozen_or_jumping_encoder_is_detected_in_either_direction(bench, direct
     assert bench.telemetry["DRIVE_FAULT_SNAPSHOT.speed_rpm"].last == pytest.approx(600 * direction, abs=10)
 
 
+# [SR-20]
 @pytest.mark.parametrize("edges", [False, True])
 @pytest.mark.parametrize("speed_rpm", [75, -150, 300])
 def test_frozen_encoder_is_detected_at_low_speed_although_the_observer_follows_it(make_bench, speed_rpm, edges):
@@ -175,6 +182,7 @@ def test_frozen_encoder_is_detected_at_low_speed_although_the_observer_follows_i
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-09]
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_single_quadrant_controller_stays_at_standstill_at_a_negative_reference(make_bench, controller):
     bench = make_bench(controller=controller)
@@ -217,6 +225,7 @@ def moving(make_bench, motion: Motion) -> Bench:
     return bench
 
 
+# [SR-11] [SR-13] [SR-15] [SR-39] [SR-40]
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("name", CASES)
 def test_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, motion, name):
@@ -243,6 +252,7 @@ def test_fault_in_any_quadrant_opens_all_switches_and_is_recorded(make_bench, mo
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-05]
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_command_timeout_opens_all_switches_in_any_quadrant(make_bench, motion):
     moves = MOTIONS[motion]
@@ -262,6 +272,7 @@ def test_command_timeout_opens_all_switches_in_any_quadrant(make_bench, motion):
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-07]
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion):
     """The load accelerates a braking drive; it first reverses a motoring one."""
@@ -283,6 +294,7 @@ def test_load_beyond_the_torque_limit_trips_over_speed_in_run(make_bench, motion
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-11]
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_trip_current_parameter_acts_in_any_quadrant(make_bench, motion):
     bench = make_bench(controller="salient")
@@ -301,6 +313,7 @@ def test_trip_current_parameter_acts_in_any_quadrant(make_bench, motion):
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-46]
 @pytest.mark.parametrize("late", [1, 2])
 def test_fewer_than_three_consecutive_overruns_are_counted_without_a_fault(bench, late):
     running(bench)
@@ -314,6 +327,7 @@ def test_fewer_than_three_consecutive_overruns_are_counted_without_a_fault(bench
     assert processor == {"used_us": 0, "worst_us": 40, "available_us": PERIOD_US, "late_interrupts": late}
 
 
+# [SR-46]
 def test_three_consecutive_overruns_are_a_fault_detected_by_the_next_interrupt(bench):
     running(bench)
     caused_us = bench.time_ns / 1000
@@ -326,6 +340,7 @@ def test_three_consecutive_overruns_are_a_fault_detected_by_the_next_interrupt(b
     assert currents_A(bench) == [0, 0, 0]
 
 
+# [SR-46]
 @pytest.mark.parametrize(("interrupt_us", "is_late"), [(PERIOD_US - 0.01, False), (PERIOD_US, False),
                                                        (PERIOD_US + 0.01, True)])
 def test_interrupt_overruns_when_it_ends_after_the_next_trigger(bench, interrupt_us, is_late):
@@ -344,6 +359,7 @@ def test_interrupt_overruns_when_it_ends_after_the_next_trigger(bench, interrupt
         assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
+# [SR-40]
 def test_first_of_two_faults_is_latched(bench):
     running(bench)
     bench.rig.supply_voltage_V = 320
@@ -354,6 +370,7 @@ def test_first_of_two_faults_is_latched(bench):
     assert bench.telemetry["DRIVE_FAULT_CAUSE.fault"].last_name == "over_voltage"
 
 
+# [SR-06]
 def test_stop_reaches_standstill_and_opens_the_switches(bench):
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.1)
@@ -367,6 +384,7 @@ def test_stop_reaches_standstill_and_opens_the_switches(bench):
     bench.load_torque_Nm = 0
 
 
+# [SR-06]
 def test_speed_ramp_is_followed(bench):
     bench.drive.parameters["speed_ramp_rpm_s"] = 2000
     bench.drive.speed_reference_rpm = 600
@@ -376,6 +394,7 @@ def test_speed_ramp_is_followed(bench):
     assert bench.truth["speed_rpm"].last == pytest.approx(600, abs=3)
 
 
+# [SR-07]
 def test_counts_faster_than_the_limit_are_over_speed_while_the_observer_still_follows(bench):
     """A dynamometer takes the shaft from 400 r/min past a limit of 600: the counts of half a millisecond exceed it by
     1/16 at 637 r/min, while the observer with a bandwidth of 100 rad/s still is 70 r/min behind."""
@@ -393,6 +412,7 @@ def test_counts_faster_than_the_limit_are_over_speed_while_the_observer_still_fo
     assert 637 < at_fault.last < 650
 
 
+# [SR-07]
 @pytest.mark.bench_each(controller=["traditional", "paper", "salient"])
 def test_a_fault_cleared_on_a_rotor_close_below_the_speed_limit_is_not_followed_by_over_speed(bench):
     """The observer keeps its speed: one that began at standstill would overshoot the limit, which is 3 % higher."""

@@ -1,4 +1,6 @@
-"""Checks that the drive makes of itself, each with a bit that flips in what it looks at."""
+"""Checks that the drive makes of itself, each with a bit that flips in what it looks at.
+[SR-49] [SR-50] [SR-51] [SR-54] [SR-55] [SR-57]
+"""
 
 from __future__ import annotations
 
@@ -62,6 +64,7 @@ def test_change_is_a_fault_in_time_that_names_what_has_changed(bench, case):
     check(bench, *CASES[case])
 
 
+# [SR-41] [SR-51]
 def test_memory_that_has_changed_is_a_fault_until_a_reset(bench):
     check(bench, *CASES["current trip"])
     bench.rig.clear_fault("limit_flipped")  # the bit is right again
@@ -76,6 +79,7 @@ def test_memory_that_has_changed_is_a_fault_until_a_reset(bench):
     assert bench.drive.fault_log[-1].self_test == ("limits",)
 
 
+# [SR-51]
 def test_a_fault_that_becomes_run_by_a_flipped_bit_stays_without_current(bench):
     """State fault and run differ in one bit, and the command to run is still there."""
     start(bench)
@@ -88,6 +92,7 @@ def test_a_fault_that_becomes_run_by_a_flipped_bit_stays_without_current(bench):
     assert max(bench.truth[f"current_{phase}_A"].value[-90:].max() for phase in "abc") < 2.0
 
 
+# [SR-55]
 def test_clock_that_is_right_again_can_be_cleared(bench):
     start(bench)
     bench.fault("clock_drift", drift_percent=-7.0, duration_s=0.05)
@@ -99,6 +104,7 @@ def test_clock_that_is_right_again_can_be_cleared(bench):
     assert bench.drive.state == "ready"
 
 
+# [SR-55]
 @pytest.mark.parametrize("drift_percent", [-4.5, 4.5])
 def test_clock_within_5_percent_is_no_fault(bench, drift_percent):
     start(bench)
@@ -107,6 +113,7 @@ def test_clock_within_5_percent_is_no_fault(bench, drift_percent):
     assert bench.drive.state == "run"
 
 
+# [SR-53]
 def test_what_the_host_has_not_is_unsupported(bench):
     for kind, arguments in (("code_flipped", {"byte": 5}), ("stack_guard_flipped", {"bit": 5})):
         with pytest.raises(FaultError, match="unsupported"):
@@ -115,6 +122,7 @@ def test_what_the_host_has_not_is_unsupported(bench):
     assert memory_item(bench, "code_passes") == memory_item(bench, "stack_unused") == 0
 
 
+# [SR-49] [SR-50] [SR-51] [SR-53] [SR-54] [SR-55]
 @pytest.mark.in_turns
 @pytest.mark.parametrize("build", ["cortex-m4", "rv32"])
 @pytest.mark.parametrize("case", ["current trip", "state, run to fault", "period of the timer", "guard of the stack"])
@@ -122,6 +130,7 @@ def test_change_on_a_target_is_a_fault_in_time(make_bench, build, case):
     check(make_bench(build=build), *(CASES | ON_TARGETS)[case])
 
 
+# [SR-53]
 @pytest.mark.parametrize("build", ["cortex-m4", "rv32"])
 def test_a_flipped_bit_of_the_program_is_found_at_a_start_which_it_prevents(make_bench, build):
     bench = make_bench(build=build)
@@ -143,6 +152,7 @@ def test_a_flipped_bit_of_the_program_is_found_at_a_start_which_it_prevents(make
     assert bench.drive.state == "ready"
 
 
+# [SR-53] [SR-54]
 @pytest.mark.in_turns
 def test_program_is_checked_within_a_minute_and_the_stack_has_unused_words(make_bench):
     bench = make_bench(build="cortex-m4", telemetry_period_ms=100)

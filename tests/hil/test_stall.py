@@ -1,4 +1,4 @@
-"""Stalled rotor."""
+"""Stalled rotor. [SR-24]"""
 
 from __future__ import annotations
 

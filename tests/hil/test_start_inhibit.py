@@ -1,4 +1,4 @@
-"""A drive that does not become ready sends the check that keeps it; contradicting parameters are refused."""
+"""A drive that does not become ready sends the check that keeps it; contradicting parameters are refused. [SR-43]"""
 
 import subprocess
 import sys
@@ -51,6 +51,7 @@ def test_scenario_without_a_command_may_leave_the_drive_as_it_is(tmp_path):
     assert run_scenario(scenario, tmp_path).fault == "none"
 
 
+# [SR-56]
 @pytest.mark.parametrize(("parameters", "bench", "message"), [
     ({"under_voltage_V": 310}, {},
      "parameters.under_voltage_V: 310 V: must be below over_voltage_V, 300 V"),
@@ -68,6 +69,7 @@ def test_contradiction_is_refused_in_one_line_that_names_both(parameters, bench,
     assert str(caught.value) == message
 
 
+# [SR-56]
 @pytest.mark.parametrize("parameters", [{}, {"current_limit_A": 75}, {"current_trip_A": 20},
                                         {"under_voltage_V": 240, "over_voltage_V": 241}])
 def test_consistent_parameters_and_a_lowered_trip_are_accepted(parameters):

@@ -1,4 +1,4 @@
-"""Measured temperatures of windings and switches: limit of the torque, trip, sensors that fail."""
+"""Measured temperatures of windings and switches: limit of the torque, trip, sensors that fail. [SR-17]"""
 
 from __future__ import annotations
 
@@ -60,6 +60,7 @@ def test_over_temperature_is_cleared_only_20_K_below_its_limit(bench, part):
         assert bench.drive.state == state, below_K
 
 
+# [SR-18]
 @pytest.mark.parametrize("phase", ["a", "c"])
 @pytest.mark.parametrize("kind", ["open", "shorted"])
 @pytest.mark.parametrize("part", PARTS)
@@ -86,6 +87,7 @@ def test_open_and_shorted_sensors_are_faults_within_100_ms_that_name_the_sensor(
     assert bench.drive.fault_log[-1].self_test == (f"{part}_sensor_{phase}",)
 
 
+# [SR-18]
 def test_an_open_sensor_keeps_a_drive_from_starting_and_is_named_by_its_status(make_bench):
     bench = make_bench()
     bench.fault("inverter_temperature_sensor_open", phase="b")
@@ -97,6 +99,7 @@ def test_an_open_sensor_keeps_a_drive_from_starting_and_is_named_by_its_status(m
     assert bench.telemetry["inverter_sensor_b"].last == 1
 
 
+# [SR-18]
 def test_an_interruption_of_less_than_20_ms_is_no_fault(bench):
     start(bench)
     bench.fault("winding_temperature_sensor_open", phase="b", duration_s=0.019)

@@ -1,4 +1,4 @@
-"""Heat of windings and switches: derating before the trip, the trip, and no effect on a healthy drive."""
+"""Heat of windings and switches: derating before the trip, the trip, and no effect on a healthy drive. [SR-16]"""
 
 from __future__ import annotations
 

@@ -67,6 +67,7 @@ def test_negative_torque_is_none_to_a_controller_that_drives_forwards_only(make_
     assert mean_torque_Nm(bench) == pytest.approx(0, abs=0.01)
 
 
+# [SR-09]
 def test_reference_is_limited_to_the_torque_limit(make_bench):
     bench = held(make_bench, 300)
     bench.drive.parameters["torque_max_Nm"] = 7
@@ -192,6 +193,7 @@ def test_run_starts_in_torque_mode_from_zero_torque_under_a_load(make_bench):
     assert (np.diff(reference.value) >= 0).all()
 
 
+# [SR-06]
 def test_stop_in_torque_mode_ends_at_standstill(make_bench):
     bench = make_bench()
     bench.drive.torque_reference_Nm = 8
@@ -205,6 +207,7 @@ def test_stop_in_torque_mode_ends_at_standstill(make_bench):
 
 # --- protections ----------------------------------------------------------------------------------------------------
 
+# [SR-08]
 @pytest.mark.parametrize("sign", [1, -1])
 def test_driving_torque_ends_below_the_over_speed_limit(make_bench, sign):
     """Free shaft, no load: the torque is reduced from 7/8 of the limit on, to none at 15/16."""
@@ -218,6 +221,7 @@ def test_driving_torque_ends_below_the_over_speed_limit(make_bench, sign):
     assert sign * mean_torque_Nm(bench) == pytest.approx(drag_Nm, abs=0.05)
 
 
+# [SR-08]
 def test_shaft_driven_by_its_load_ends_in_over_speed(make_bench):
     bench = make_bench()
     bench.drive.parameters["over_speed_rpm"] = 800
@@ -227,6 +231,7 @@ def test_shaft_driven_by_its_load_ends_in_over_speed(make_bench):
     assert bench.drive.fault == "over_speed"
 
 
+# [SR-05]
 def test_commands_that_stop_coming_end_torque_mode(make_bench):
     bench = held(make_bench, 300)
     bench.drive.torque_reference_Nm = 5

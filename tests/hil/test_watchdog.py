@@ -1,4 +1,4 @@
-"""The watchdog: what hangs ends with open switches and a reset, and the drive starts in fault."""
+"""The watchdog: what hangs ends with open switches and a reset, and the drive starts in fault. [SR-47]"""
 
 from __future__ import annotations
 
@@ -73,6 +73,7 @@ def test_what_hangs_ends_within_20_ms_with_open_switches_and_a_drive_in_fault(ma
     assert not bench.drive.armed
 
 
+# [SR-48]
 def test_a_drive_that_the_watchdog_has_reset_runs_after_it_was_cleared_and_armed_and_not_before(bench):
     running(bench)
     bench.fault("background_hung", duration_s=0.025)
@@ -108,6 +109,7 @@ def test_interrupts_that_end_in_time_are_no_reset(make_bench, interrupt_us, cont
     assert bench.drive.state == "run"
 
 
+# [SR-48]
 def test_a_reset_from_outside_is_no_fault(bench):
     running(bench)
     bench.rig.drive_reset = 1

@@ -361,6 +361,7 @@ TEST_F(Drive, has_one_of_eight_nodes_and_no_other) {
     }
 }
 
+// [SR-03]
 TEST_F(Drive, lines_of_the_torque_off_that_differ_for_200_ms_are_a_failed_check_and_before_they_are_none) {
     periods(100);
     hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_STO_2;
@@ -393,6 +394,7 @@ TEST_F(Drive,
     }
 }
 
+// [SR-47]
 TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everything_advances) {
     EXPECT_EQ(hal.watchdog_starts, 1u);
     periods(4000); // 100 ms
@@ -400,6 +402,7 @@ TEST_F(Drive, starts_the_watchdog_and_kicks_it_every_millisecond_while_everythin
     EXPECT_LE(hal.kicks, 100u);
 }
 
+// [SR-47]
 TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
     const std::vector<std::function<void()>> without = {
         // Background, deferred interrupt, control interrupt.
@@ -421,6 +424,7 @@ TEST_F(Drive, kicks_the_watchdog_no_more_when_one_of_the_three_stands_still) {
     }
 }
 
+// [SR-48]
 TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_cleared_and_armed) {
     hal.reset_cause = HAL_RESET_WATCHDOG;
     SetUp();
@@ -445,6 +449,7 @@ TEST_F(Drive, after_a_reset_by_the_watchdog_is_in_fault_and_runs_only_when_clear
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
 }
 
+// [SR-53]
 TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
     const std::array<uint32_t, 3> program{1, 2, 3};
     hal_t changed;
@@ -467,6 +472,7 @@ TEST_F(Drive, with_a_changed_program_starts_in_a_fault_that_is_not_cleared) {
     EXPECT_TRUE(changed.open);
 }
 
+// [SR-18]
 TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
     hal.temperature_code[HAL_ADC_INVERTER + 1] = 65520;
     periods(100);
@@ -477,6 +483,7 @@ TEST_F(Drive, with_an_open_temperature_sensor_is_kept_from_starting_by_that) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+// [SR-58]
 TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_background) {
     drive.store.inhibited = true;
     periods(100);
@@ -487,6 +494,58 @@ TEST_F(Drive, a_stored_set_that_cannot_be_used_keeps_it_from_starting_in_every_b
     EXPECT_TRUE(hal.open);
 }
 
+// [SR-58]
+TEST_F(Drive, a_stored_set_that_is_damaged_keeps_it_from_starting_before_the_first_background) {
+    parameter_store_save(&drive.store);
+    periods(400);
+    ASSERT_EQ(nvm_read(&hal.nvm, 0, 0) != UINT64_MAX, true) << "stored";
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.control.reported_fault_mask, 0u);
+    hal.nvm.word[0][4] ^= 1;
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.control.reported_fault_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+    for (int k = 0; k < 100; k++) { // interrupts alone
+        hal.time_us += 25;
+        drive_control_interrupt(&drive, &hal);
+        deferred_interrupt(&drive, &hal);
+    }
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_INITIALISE);
+    EXPECT_EQ(drive.control.state_machine.start_inhibit_mask, FAULT_BIT(FAULT_PARAMETER_MEMORY));
+}
+
+// The ramp of overdue commands runs after a request to stop, and the request before a bus-off ages.
+// [SR-51]
+TEST_F(Drive, a_request_in_effect_may_differ_from_the_received_one_in_the_ramp_after_a_stop_and_after_bus_off_alone) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    const drive_t running = drive;
+    const hal_t before = hal;
+    const struct {
+        bool ramping, inhibited;
+        command_request_t in_effect, received;
+        bool intact;
+    } cases[] = {
+        {false, false, COMMAND_RUN, COMMAND_RUN, true},   {true, false, COMMAND_RUN, COMMAND_STOP, true},
+        {false, false, COMMAND_RUN, COMMAND_STOP, false}, {true, false, COMMAND_STOP, COMMAND_RUN, false},
+        {true, false, COMMAND_RUN, COMMAND_OFF, false},   {true, false, COMMAND_OFF, COMMAND_STOP, false},
+        {false, true, COMMAND_RUN, COMMAND_OFF, true},
+    };
+    for (const auto &one : cases) {
+        drive = running;
+        hal = before;
+        drive.ramping = one.ramping;
+        drive.comms.bus.run_inhibited = one.inhibited;
+        drive.command.request = one.in_effect;
+        drive.comms.command.request = one.received;
+        drive_background(&drive, &hal);
+        EXPECT_EQ((drive.self_test.failed & SELF_TEST_FAULT_LATCH) == 0, one.intact)
+            << one.ramping << one.inhibited << one.in_effect << one.received;
+    }
+}
+
+// [SR-51]
 TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     command(COMMAND_RUN);
@@ -506,6 +565,7 @@ TEST_F(Drive, a_changed_latch_is_the_fault_memory_from_the_next_background_on) {
     EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
 }
 
+// [SR-50]
 TEST_F(Drive, a_changed_constant_of_the_heat_is_a_failed_check_within_2_ms) {
     uint32_t *const words[] = {&drive.control_parameters.thermal.winding.inverse_q48,
                                &drive.control_parameters.thermal.switches.rate_q48,
@@ -524,6 +584,7 @@ TEST_F(Drive, a_changed_constant_of_the_heat_is_a_failed_check_within_2_ms) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, of_a_run_that_a_changed_state_ends_the_next_background_leaves_neither_duties_nor_a_torque) {
     periods(100);
     command(COMMAND_RUN);
@@ -565,6 +626,7 @@ TEST_F(Drive, a_command_closes_switches_and_off_opens_them) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
 }
 
+// [SR-51]
 TEST_F(Drive, a_command_to_run_that_has_not_come_is_the_fault_memory_from_the_next_background_on) {
     periods(100);
     send(COMMAND_OFF);
@@ -650,6 +712,7 @@ TEST_F(Drive, a_flipped_bit_of_an_index_leads_nowhere_outside_of_its_array) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
     periods(100);
     command(COMMAND_RUN);
@@ -667,6 +730,7 @@ TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
     }
 }
 
+// [SR-51]
 TEST_F(Drive, a_state_that_is_none_is_the_fault_memory) {
     periods(100);
     ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
@@ -688,6 +752,7 @@ TEST_F(Drive, a_control_rate_that_has_changed_in_memory_gives_no_constants) {
     EXPECT_EQ(drive.self_test.failed & SELF_TEST_PARAMETERS, SELF_TEST_PARAMETERS);
 }
 
+// [SR-51]
 TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     periods(100);
     command(COMMAND_RUN);
@@ -699,6 +764,7 @@ TEST_F(Drive, a_received_command_that_changes_in_a_run_is_the_fault_memory) {
     EXPECT_TRUE(hal.open);
 }
 
+// [SR-51] [SR-52]
 TEST_F(Drive, a_bit_of_a_run_s_request_or_arming_that_flips_does_not_end_the_run_without_a_fault) {
     periods(100);
     command(COMMAND_RUN);
@@ -747,6 +813,263 @@ TEST_F(Drive, an_angle_beyond_what_is_learned_is_the_fault_memory) {
     }
 }
 
+// [SR-07]
+TEST_F(Drive, counts_faster_than_the_limit_are_over_speed_within_a_millisecond_in_either_direction) {
+    for (const int direction : {1, -1}) {
+        SetUp();
+        periods(100);
+        double counts = hal.encoder_counts;
+        const auto turn = [&](double part) {
+            counts += direction * part * drive.parameters.values[PARAMETER_OVER_SPEED_RPM] / 60.0 * 25e-6 * 131072.0;
+            hal.encoder_counts = uint32_t(int64_t(std::floor(counts))) & 131071u;
+            periods(1);
+        };
+        for (int k = 0; k < 8000; k++) {
+            turn(0.95 * std::min(k / 4000.0, 1.0));
+        }
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY) << direction;
+        int until = 0;
+        while (until < 400 && drive.control.state_machine.state == DRIVE_STATE_READY) {
+            turn(1.15);
+            until++;
+        }
+        EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_OVER_SPEED) << direction;
+        EXPECT_LE(until, 44) << "1 ms, and the period of the background's check";
+        EXPECT_GE(until, 4);
+    }
+}
+
+// A phase without current while there is voltage. [SR-31]
+TEST_F(Drive, a_lost_phase_is_switched_off_where_that_is_allowed_until_a_fault_is_cleared_outside_of_the_run) {
+    for (const bool allowed : {false, true}) {
+        SetUp();
+        counter = 0;
+        hal.adc.phase_current_counts[0] = hal.adc.phase_current_counts[1] = hal.adc.phase_current_counts[2] = 0;
+        std::fill(std::begin(flux_Wb), std::end(flux_Wb), 0.0);
+        parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, allowed ? 1 : 0);
+        drive.parameters.revision++;
+        periods(100);
+        command(COMMAND_RUN);
+        int lost = -1;
+        for (int k = 0; k < 40 && lost < 0 && drive.control.state_machine.state != DRIVE_STATE_FAULT; k++) {
+            periods(1);
+            for (int phase = 0; phase < 3; phase++) { // the first phase that is switched on is open
+                if (lost < 0 && !hal.open && hal.written.upper[phase] + hal.written.lower[phase] > 2600) {
+                    lost = phase;
+                }
+            }
+        }
+        ASSERT_GE(lost, 0);
+        for (int k = 0; k < 40 && drive.control.state_machine.state == DRIVE_STATE_RUN && drive.degraded.lost == 0;
+             k++) {
+            hal.adc.phase_current_counts[lost] = 0;
+            flux_Wb[lost] = 0.0;
+            periods(1);
+        }
+        if (!allowed) {
+            EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_PHASE_OPEN);
+            EXPECT_EQ(drive.control.lost_phase, 0u);
+            continue;
+        }
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        EXPECT_EQ(drive.degraded.lost, 1u << lost);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u);
+        periods(4);
+        EXPECT_LE(hal.written.upper[lost] + hal.written.lower[lost], 0) << "its switches stay open";
+        send(COMMAND_CLEAR_FAULT); // refused in a run
+        periods(4);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u);
+        send(COMMAND_OFF);
+        periods(4);
+        EXPECT_EQ(drive.control.lost_phase, unsigned(lost) + 1u) << "the end of the run gives nothing back";
+        send(COMMAND_CLEAR_FAULT);
+        periods(8);
+        EXPECT_EQ(drive.control.lost_phase, 0u);
+        EXPECT_EQ(drive.degraded.lost, 0u);
+    }
+}
+
+TEST_F(Drive, a_position_command_reaches_the_interrupt_with_the_parameter_s_homing_and_telemetry_has_its_state) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    hal.to_drive.push_back(frames::position_command(++counter, COMMAND_RUN, POSITION_ORDER_PROFILE, 1 << 16));
+    arm_for_run(7);
+    periods(4);
+    hal.to_drive.push_back(frames::position_command(++counter, COMMAND_RUN, POSITION_ORDER_PROFILE, 1 << 16));
+    periods(4);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(drive.control.position_command.set_point.order, POSITION_ORDER_PROFILE);
+    EXPECT_EQ(drive.control.position_command.set_point.target, POSITION_ONE_REV / 4);
+    EXPECT_EQ(int(drive.control.position_command.set_point.homing), drive.parameters.values[PARAMETER_HOMING_METHOD]);
+    EXPECT_TRUE(drive.control.position.status.active);
+    const auto state = [this] {
+        drive_telemetry_t values{};
+        telemetry_collect(&drive, &hal, hal.time_us, &values);
+        EXPECT_EQ(values.status.mode, DRIVE_MODE_POSITION);
+        return drive_position_state_t(values.position.position_state);
+    };
+    position_status_t *status = &drive.control.position.status;
+    for (const auto &[set, expected] : std::vector<std::pair<position_status_t, drive_position_state_t>>{
+             {{.reference_ended = false}, DRIVE_POSITION_STATE_MOVING},
+             {{.reference_ended = true}, DRIVE_POSITION_STATE_ARRIVED},
+             {{.in_position = true, .reference_ended = true}, DRIVE_POSITION_STATE_IN_POSITION},
+             {{.homing = true, .in_position = true}, DRIVE_POSITION_STATE_HOMING},
+             {{.homing = true, .following_error = true}, DRIVE_POSITION_STATE_FOLLOWING_ERROR}}) {
+        *status = set;
+        status->active = true;
+        EXPECT_EQ(state(), expected);
+    }
+}
+
+TEST_F(Drive, an_experiment_drives_its_phase_and_is_over_with_its_limit_or_without_commands) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    const auto experiment = [this](uint8_t number) {
+        hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_PULSE, 1, number));
+    };
+    experiment(1);
+    arm_for_run(7);
+    periods(2);
+    experiment(2); // another number begins
+    int most[3] = {};
+    for (int k = 0; k < 40; k++) {
+        periods(1);
+        for (unsigned phase = 0; phase < 3; phase++) {
+            most[phase] = std::max(most[phase], int(hal.adc.phase_current_counts[phase]));
+        }
+    }
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_TRUE(drive.control.state_machine.identifies);
+    EXPECT_FALSE(hal.open);
+    EXPECT_GT(most[1], 0);
+    EXPECT_EQ(most[0] + most[2], 0);
+    // Commands that are overdue end it at once: there is no torque to ramp.
+    hal.adc.phase_current_counts[1] = 0;
+    periods(int(51000 - (hal.time_us - drive.command.time_us)) / 25);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE);
+    EXPECT_TRUE(hal.open);
+}
+
+TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config)); // experiments are the controller salient's
+    periods(100);
+    hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_HOLD, 1));
+    arm_for_run(7);
+    periods(2);
+    hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_HOLD, 1));
+    periods(4);
+    EXPECT_EQ(drive.identify.state, IDENTIFY_ENDED);
+    EXPECT_EQ(drive.identify.limit, IDENTIFY_CONTROLLER);
+    EXPECT_EQ(drive.command.request, COMMAND_OFF);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_TRUE(hal.open);
+}
+
+// Torque that would carry the speed beyond the last reference ends at once; towards it, and in torque mode, it ramps.
+// [SR-04]
+TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_in_either_direction) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    periods(3);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const drive_t running = drive;
+    const uint32_t time_us = hal.time_us;
+    const double rad_s = 2.0 * 3.14159265358979 / 60.0 * 4194304.0;
+    for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
+        for (const int direction : {1, -1}) {
+            for (const double speed_rpm : {500.0, 630.0, 645.0}) {
+                drive = running;
+                drive.command.mode = mode;
+                drive.command.speed_reference_q22 = int32_t(direction * 600.0 * rad_s);
+                drive.control.observer.speed_q22 = int32_t(direction * speed_rpm * rad_s);
+                drive.control.torque_reference_q24 = direction * (4 << 24);
+                hal.time_us = drive.command.time_us + 60000;
+                drive_background(&drive, &hal);
+                const bool beyond = mode == DRIVE_MODE_SPEED && speed_rpm > 640.0; // by a sixteenth
+                EXPECT_NEAR(drive.command.torque_reference_q24 / 16777216.0, beyond ? 0.0 : direction * 3.6, 0.01)
+                    << mode << direction << speed_rpm;
+            }
+        }
+    }
+    hal.time_us = time_us;
+}
+
+// Boot-up, heartbeat and SDO instead of the frames of drive.dbc, whose commands have no effect. [SR-38]
+TEST_F(Drive, as_a_node_of_canopen_it_speaks_that_protocol_alone_and_is_enabled_by_its_state_machine_alone) {
+    drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    config.canopen_node = 5;
+    hal.from_drive.clear();
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    const auto receive = [this](uint32_t identifier, const std::vector<uint8_t> &data) {
+        hal_can_frame_t frame{};
+        frame.identifier = identifier;
+        frame.length = uint8_t(data.size());
+        std::copy(data.begin(), data.end(), frame.data);
+        hal.to_drive.push_back(frame);
+        periods(44);
+    };
+    const auto sent = [this](uint32_t identifier) {
+        return std::count_if(hal.from_drive.begin(), hal.from_drive.end(),
+                             [&](const hal_can_frame_t &frame) { return frame.identifier == identifier; });
+    };
+    const auto control = [&](uint8_t word) { receive(0x605, {0x2B, 0x40, 0x60, 0, word, 0, 0, 0}); };
+    periods(400);
+    EXPECT_EQ(sent(0x705), 1) << "boot-up";
+    command(COMMAND_RUN);
+    periods(44);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.comms.commands.counters.accepted, 0);
+    receive(0, {1, 5});
+    receive(0x605, {0x2F, 0x60, 0x60, 0, 1, 0, 0, 0}); // profile position
+    control(6);
+    control(7);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    control(15);
+    periods(44);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(int(drive.control.position_command.set_point.homing), drive.parameters.values[PARAMETER_HOMING_METHOD]);
+    EXPECT_EQ(drive.comms.canopen.place.position, drive.control.position.status.position);
+    EXPECT_GE(sent(0x585), 4) << "answers of SDO";
+    EXPECT_EQ(sent(DRIVE_STATUS_FRAME_ID), 0);
+    hal.can_status.state = HAL_CAN_BUS_OFF;
+    periods(4);
+    EXPECT_FALSE(drive.comms.bus.run_inhibited) << "what was enabled has to be enabled anew";
+    hal.can_status.state = HAL_CAN_ERROR_ACTIVE;
+    periods(4000);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_NONE);
+}
+
+TEST_F(Drive, telemetry_has_the_scale_of_the_tables_single_pulses_and_the_controller) {
+    drive_telemetry_t values{};
+    for (const double scale : {0.75, 1.0, 1.25}) {
+        drive.control.table_scale.excess_q31 = int32_t((scale - 1.0) * 0x1p31);
+        drive.control.deferred.conduction.single_pulse = scale > 1.0;
+        telemetry_collect(&drive, &hal, hal.time_us, &values);
+        EXPECT_EQ(values.estimates.table_scale, unsigned(scale * 0x1p15));
+        EXPECT_EQ(values.status.single_pulse, scale > 1.0);
+    }
+    EXPECT_EQ(values.heartbeat.controller, unsigned(DRIVE_CONTROLLER_PAPER));
+}
+
+TEST_F(Drive, has_the_period_of_telemetry_of_its_configuration_and_else_the_parameter_s) {
+    const int32_t usual = drive.parameters.values[PARAMETER_TELEMETRY_PERIOD_MS];
+    drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+    config.telemetry_period_ms = uint32_t(usual) + 7u;
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    EXPECT_EQ(drive.parameters.values[PARAMETER_TELEMETRY_PERIOD_MS], usual + 7);
+}
+
+// [SR-05]
 TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     periods(100);
     command(COMMAND_RUN);
@@ -762,6 +1085,7 @@ TEST_F(Drive, opens_the_switches_when_commands_stop_coming) {
     EXPECT_EQ(drive.command.request, COMMAND_OFF);
 }
 
+// [SR-04]
 TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_and_comes_back_with_them) {
     for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
         SetUp();
@@ -801,6 +1125,7 @@ TEST_F(Drive, without_commands_the_torque_ramps_to_zero_in_a_tenth_of_a_second_a
     }
 }
 
+// [SR-04]
 TEST_F(Drive, a_second_ramp_to_zero_begins_at_the_torque_of_its_time) {
     periods(100);
     command(COMMAND_RUN, 1000.0);
@@ -813,6 +1138,7 @@ TEST_F(Drive, a_second_ramp_to_zero_begins_at_the_torque_of_its_time) {
     }
 }
 
+// [SR-05]
 TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     periods(100);
     command(COMMAND_RUN);
@@ -830,6 +1156,7 @@ TEST_F(Drive, a_background_that_hangs_ends_the_run_after_half_a_second) {
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
 }
 
+// [SR-34]
 TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
     periods(100);
     command(COMMAND_RUN);
@@ -851,6 +1178,7 @@ TEST_F(Drive, one_frame_after_a_silence_does_not_start_it) {
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
 }
 
+// [SR-33]
 TEST_F(Drive, four_bad_commands_end_the_run_with_the_record_of_the_moment) {
     periods(100);
     command(COMMAND_RUN);
@@ -966,6 +1294,7 @@ TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_
     }
 }
 
+// [SR-46]
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -976,6 +1305,7 @@ TEST_F(Drive, lost_interrupts_reach_the_protection) {
     EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_INTERRUPT_OVERRUN);
 }
 
+// [SR-02] [SR-12] [SR-45]
 TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
     const struct {
         uint32_t cause;
@@ -1008,7 +1338,7 @@ TEST_F(Drive, break_of_the_pwm_is_a_fault_that_lasts_as_long_as_its_cause) {
     }
 }
 
-// With coarse counts 16 bits of the angle show where in its count it is.
+// With coarse counts 16 bits of the angle show where in its count it is. [SR-40]
 TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_period_of_the_fault) {
     hal.encoder_bits = 10;
     hal.encoder_counts = 300;
@@ -1027,6 +1357,7 @@ TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_pe
     EXPECT_EQ(fault_trace_period(&drive.trace, FAULT_TRACE_PERIODS), nullptr);
 }
 
+// [SR-46]
 TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     const auto late = [this](int count) {
         for (int k = 0; k < count; k++) {
@@ -1050,6 +1381,7 @@ TEST_F(Drive, three_late_interrupts_in_a_row_open_the_switches_and_two_do_not) {
     EXPECT_EQ(drive.control.protection.late_interrupts, 5u);
 }
 
+// [SR-46]
 TEST_F(Drive, an_interrupt_that_loses_three_triggers_is_one_late_interrupt_and_a_fault) {
     periods(100);
     command(COMMAND_RUN);
@@ -1128,6 +1460,7 @@ TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_
     EXPECT_EQ(deferred.skipped_periods, 2);
 }
 
+// [SR-46]
 TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
     periods(100);
     command(COMMAND_RUN);
@@ -1154,6 +1487,7 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
 }
 
+// [SR-56]
 TEST_F(Drive, five_unprotected_frames_change_nothing) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1198,6 +1532,7 @@ TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
     EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1215,7 +1550,7 @@ TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     EXPECT_FALSE(drive.comms.commands.arming.configuring);
 }
 
-// A set copies, applies and stores only values that have not changed in memory since they were set.
+// A set copies, applies and stores only values that have not changed in memory since they were set. [SR-57]
 TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into_effect_nor_stored) {
     periods(100);
     const int32_t trip_q9 = drive.control_parameters.protection.current_trip_q9;
@@ -1243,6 +1578,7 @@ TEST_F(Drive, a_parameter_that_changed_in_memory_is_a_fault_and_neither_put_into
     EXPECT_EQ(drive.store.parameters.sequence, 0u);
 }
 
+// [SR-57]
 TEST_F(Drive, a_staged_value_that_changed_in_memory_is_not_applied) {
     periods(100);
     auto set = frames::parameter_set(arm_for_configuration(), {{PARAMETER_TORQUE_MAX_NM, 5 << 24}});
@@ -1259,6 +1595,7 @@ TEST_F(Drive, a_staged_value_that_changed_in_memory_is_not_applied) {
     EXPECT_EQ(std::memcmp(&before, &drive.parameters, sizeof before), 0);
 }
 
+// [SR-56]
 TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
     periods(100);
     std::vector<hal_can_frame_t> recording{frames::arm(7, ARMING_STEP_REQUEST_CONFIGURATION)};
@@ -1282,6 +1619,7 @@ TEST_F(Drive, a_recording_of_a_set_changes_nothing) {
     EXPECT_GE(drive.comms.commands.arming.refused, 4 * 4);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1341,6 +1679,7 @@ TEST_F(Drive, a_set_with_a_missing_a_changed_or_an_additional_frame_is_refused) 
     EXPECT_EQ(std::memcmp(before.values, drive.parameters.values, sizeof before.values), 0);
 }
 
+// [SR-56]
 TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     periods(100);
     const parameters_t before = drive.parameters;
@@ -1410,6 +1749,7 @@ TEST_F(Drive, a_refused_set_names_its_parameters_and_changes_nothing) {
     EXPECT_EQ(set({{PARAMETER_OVER_VOLTAGE_V, 300 << 6}}).status, PARAMETER_STATUS_DONE);
 }
 
+// [SR-56]
 TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_seconds) {
     periods(100);
     const auto armed = [this] { return drive.comms.commands.arming.configuring; };
@@ -1456,7 +1796,7 @@ TEST_F(Drive, armed_for_configuration_ends_with_the_set_a_run_bus_off_and_two_se
     arm(); // for tunable parameters
 }
 
-// A rotor at 9.6 rad/s, which a stop ramps down.
+// A rotor at 9.6 rad/s, which a stop ramps down. [SR-56]
 TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
     const auto turn = [this](int count) {
         for (int k = 0; k < count; k++) {
@@ -1493,7 +1833,7 @@ TEST_F(Drive, while_a_stop_lasts_only_tunable_parameters_change) {
     }
 }
 
-// The control parameters always belong to the whole set, though a run takes over parts of them only.
+// The control parameters always belong to the whole set, though a run takes over parts of them only. [SR-56]
 TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     periods(100);
     command(COMMAND_RUN);
@@ -1525,6 +1865,7 @@ TEST_F(Drive, tunable_parameters_change_in_a_run_and_others_do_not) {
     EXPECT_EQ(drive.control.deferred.speed_smc.delta_q27, drive.control_parameters.speed_smc.delta_q27);
 }
 
+// [SR-56]
 TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_changed_in_run) {
     periods(100);
     // Armed for a run by commands other than run.
@@ -1565,6 +1906,7 @@ TEST_F(Drive, an_interrupt_after_any_critical_section_never_has_its_parameters_c
 }
 
 // Frames of sets in any order, lost, damaged, recorded, with runs between: a model of the host says what may change.
+// [SR-56]
 TEST_F(Drive, random_frames_change_parameters_only_as_a_whole_checked_set_of_an_armed_host) {
     periods(100);
     std::mt19937 random(16);
@@ -1723,6 +2065,7 @@ TEST_F(Drive, telemetry_reports_what_the_interrupt_saw_and_did) {
     EXPECT_GT(*std::max_element(most_counts, most_counts + 3), 200u);
 }
 
+// [SR-09]
 TEST_F(Drive, telemetry_reports_the_available_torque_of_each_direction_and_what_limits_it) {
     for (const drive_controller_t controller : {DRIVE_CONTROLLER_PAPER, DRIVE_CONTROLLER_SALIENT}) {
         const drive_config_t config = {.control_rate_hz = 40000, .controller = controller};
@@ -1798,6 +2141,7 @@ TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
 }
 #endif
 
+// [SR-09]
 TEST_F(Drive, telemetry_names_the_lost_phase_s_limit_of_the_available_torque_whichever_is_lost) {
     for (const uint32_t lost : {1u, 2u, 4u}) {
         drive.degraded.lost = lost;
@@ -1830,6 +2174,7 @@ TEST_F(Drive, the_scale_of_the_tables_that_has_been_found_takes_effect_in_the_in
     }
 }
 
+// [SR-60]
 TEST_F(Drive, a_logged_fault_names_the_phases_that_have_had_one) {
     periods(100);
     drive.flux.phases = 4u;
@@ -1873,6 +2218,7 @@ TEST_F(Drive, two_drives_in_a_process_do_not_know_of_each_other) {
     EXPECT_EQ(other_hal.starts, std::vector<uint16_t>{5000});
 }
 
+// [SR-35]
 TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_round) {
     hal.adc.bus_voltage_counts = 0; // the link is off: the drive stays in its initial state
     command(COMMAND_OFF);
@@ -1891,7 +2237,7 @@ TEST_F(Drive, a_run_of_a_sender_long_silent_starts_nothing_when_the_clock_comes_
     EXPECT_EQ(hal.writes, 0u);
 }
 
-// Bus-off: the error counter is above 255 until the controller has rejoined.
+// Bus-off: the error counter is above 255 until the controller has rejoined. [SR-38]
 TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_error_free_second_resets) {
     const auto wait_us = [this] {
         hal.can_status = {.state = HAL_CAN_BUS_OFF, .transmit_errors = 256, .receive_errors = 0};
@@ -1922,7 +2268,7 @@ TEST_F(Drive, rejoins_the_bus_with_a_back_off_that_doubles_up_to_320_ms_and_an_e
     EXPECT_EQ(state.bus_state, BUS_STATE_ERROR_ACTIVE);
 }
 
-// The controller has gone off the bus again before the drive has seen that it had rejoined.
+// The controller has gone off the bus again before the drive has seen that it had rejoined. [SR-38]
 TEST_F(Drive, requests_to_rejoin_again_when_bus_off_has_not_ended) {
     hal.can_status.state = HAL_CAN_BUS_OFF;
     periods(440); // 11 ms
@@ -1935,6 +2281,7 @@ TEST_F(Drive, requests_to_rejoin_again_when_bus_off_has_not_ended) {
     EXPECT_EQ(hal.rejoins, 7u); // 40, 80, 160, 320, 320 ms later
 }
 
+// [SR-38]
 TEST_F(Drive, after_bus_off_a_run_request_counts_only_once_it_has_been_withdrawn) {
     periods(100);
     command(COMMAND_RUN, 0);
@@ -1976,6 +2323,7 @@ TEST_F(Drive, error_counters_are_reported) {
     EXPECT_EQ(hal.rejoins, 0u);
 }
 
+// [SR-37]
 TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault_until_a_second_without) {
     periods(100);
     command(COMMAND_RUN);
@@ -2001,6 +2349,7 @@ TEST_F(Drive, a_frame_of_another_node_with_an_identifier_of_the_drive_is_a_fault
     EXPECT_EQ(clear(), DRIVE_STATE_READY);
 }
 
+// [SR-37]
 TEST_F(Drive, no_other_identifier_length_or_flag_is_an_identifier_conflict_or_changes_the_state) {
     const std::vector<uint32_t> for_drive = {DRIVE_COMMAND_FRAME_ID, DRIVE_TORQUE_COMMAND_FRAME_ID,
                                              DRIVE_PARAMETER_REQUEST_FRAME_ID};

@@ -1,5 +1,5 @@
 /* The mean torque keeps to the limit that the client has set and to the one that telemetry announces before or after;
- * and telemetry announces none above the one that the client has set. */
+ * and telemetry announces none above the one that the client has set. [SR-09] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

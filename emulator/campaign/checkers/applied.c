@@ -1,4 +1,4 @@
-/* A set of parameters with a wrong check is not applied. */
+/* A set of parameters with a wrong check is not applied. [SR-56] */
 #include "campaign/checkers/checker.h"
 
 static void on_frame(const observation_t *seen, void *memory, checker_report_t *report, const checker_frame_t *frame) {

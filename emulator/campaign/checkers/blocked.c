@@ -1,5 +1,5 @@
 /* While a speed is commanded, the rotor does not stay within a quarter of a stroke for 300 ms and three strokes, nor
- * within a stroke for 500 ms and six: a swing that grows is no standstill. */
+ * within a stroke for 500 ms and six: a swing that grows is no standstill. [SR-24] */
 #include "campaign/checkers/checker.h"
 
 #include "fault_kinds.h"

@@ -1,6 +1,6 @@
 /* A fault ends, and a start-up passes, only when its cause has gone: not less than 8 ms after the plant's last reason
  * for one, not before both lines of safe torque off that had differed have been off together, nor before a frozen
- * encoder counts; and not by a request to clear that was there before the fault. */
+ * encoder counts; and not by a request to clear that was there before the fault. [SR-41] */
 #include "campaign/checkers/checker.h"
 
 enum { CLEARED_BEFORE = 4, CLEARED_UNCOUNTED, CLEARED_LINES }; /* besides STATE_INITIALISE and STATE_FAULT */

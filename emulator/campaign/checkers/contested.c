@@ -1,5 +1,6 @@
 /* A drive does not run for 150 ms while another client sends commands, or forged ones, or frames that are the drive's.
- * Where the drive may receive no command, or late, or after a bus-off follows none, it has nothing to judge by. */
+ * Where the drive may receive no command, or late, or after a bus-off follows none, it has nothing to judge by.
+ * [SR-36] [SR-37] */
 #include "campaign/checkers/checker.h"
 
 #define TIME_NS (150 * MS_NS)

@@ -1,5 +1,5 @@
 /* Without any fault of the bench, the bus or a client the drive latches none, unless it is true of the plant and not
- * the drive's own work. */
+ * the drive's own work. [SR-30] */
 #include "campaign/checkers/checker.h"
 #include "campaign/checkers/explanation.h"
 

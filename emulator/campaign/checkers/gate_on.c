@@ -1,4 +1,5 @@
-/* A gate is on in state run only, with both lines of safe torque off energised, and while control interrupts come. */
+/* A gate is on in state run only, with both lines of safe torque off energised, and while control interrupts come.
+ * [SR-01] [SR-39] [SR-45] */
 #include "campaign/checkers/checker.h"
 
 #include "fault_kinds.h"

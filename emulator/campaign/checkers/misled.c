@@ -1,5 +1,5 @@
 /* A drive does not run for 200 ms by a measured angle that is off by more than a sixth of a rotor pitch, at which a
- * phase makes torque in the other direction. */
+ * phase makes torque in the other direction. [SR-20] [SR-22] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* On an undisturbed bus the drive's status comes within 100 ms, bus-off for the second time included. */
+/* On an undisturbed bus the drive's status comes within 100 ms, bus-off for the second time included. [SR-38] */
 #include "campaign/checkers/checker.h"
 
 #define TIME_NS (100 * MS_NS)

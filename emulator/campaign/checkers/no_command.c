@@ -1,5 +1,5 @@
 /* A gate is on only by a request to run, of an armed client, that is neither withdrawn nor too old; after a fault and
- * after a reset by the watchdog only when a client has cleared it. */
+ * after a reset by the watchdog only when a client has cleared it. [SR-34] [SR-35] [SR-41] [SR-48] */
 #include "campaign/checkers/checker.h"
 
 enum {

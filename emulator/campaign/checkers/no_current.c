@@ -1,5 +1,5 @@
 /* In a run no phase gets voltage for twenty times its largest flux linkage, in pulses of more than three periods, and
- * no current at all. */
+ * no current at all. [SR-25] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,4 +1,5 @@
-/* The limit of the torque in telemetry is not above what the loads and temperatures in the same frame leave. */
+/* The limit of the torque in telemetry is not above what the loads and temperatures in the same frame leave.
+ * [SR-16] [SR-17] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

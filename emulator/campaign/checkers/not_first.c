@@ -1,4 +1,4 @@
-/* The first cause is the first one, by its number, of the checks that failed in its tick. */
+/* The first cause is the first one, by its number, of the checks that failed in its tick. [SR-40] */
 #include "campaign/checkers/checker.h"
 
 static void on_interrupt(const observation_t *seen, void *memory, checker_report_t *report) {

@@ -1,6 +1,6 @@
 /* After the faults, cleared, armed and commanded, the drive runs again within 150 ms, is at the speed 100 ms after the
  * time that half of the torque limit needs, has no further fault until then, and uses all its phases. Judged up to 0.9
- * of the base speed, and unless what keeps a drive in a fault is still there. */
+ * of the base speed, and unless what keeps a drive in a fault is still there. [SR-41] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* 60 ms after the last control interrupt the watchdog has reset the drive. */
+/* 60 ms after the last control interrupt the watchdog has reset the drive. [SR-47] */
 #include "campaign/checkers/checker.h"
 
 #define TIME_NS (60 * MS_NS)

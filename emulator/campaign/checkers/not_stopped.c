@@ -1,5 +1,5 @@
 /* A request to stop makes the rotor no faster, and brings the rotor of a four-quadrant drive to rest while it is heard:
- * 100 ms after the time that half of the torque limit needs. */
+ * 100 ms after the time that half of the torque limit needs. [SR-06] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,5 +1,5 @@
 /* No phase's current is above the comparators' threshold in two looks in succession while a gate of it is on. Without a
- * gate no drive can end a current, which the rotor or a shorted switch then drives. */
+ * gate no drive can end a current, which the rotor or a shorted switch then drives. [SR-10] [SR-11] */
 #include "campaign/checkers/checker.h"
 
 #define LOOKS 2

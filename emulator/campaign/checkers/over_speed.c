@@ -1,4 +1,4 @@
-/* No gate is on for 2 ms at a speed above the limit by 2 %. */
+/* No gate is on for 2 ms at a speed above the limit by 2 %. [SR-07] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,5 +1,5 @@
 /* No gate is on for 200 us at a link voltage above the limit by 2 %. Only of a machine whose supply takes no energy
- * back, and with a healthy sensor, which is the only one. */
+ * back, and with a healthy sensor, which is the only one. [SR-13] [SR-14] */
 #include "campaign/checkers/checker.h"
 
 #define MARGIN 1.02

@@ -1,4 +1,4 @@
-/* After bus-off a request to run has to be withdrawn before it starts the drive again. */
+/* After bus-off a request to run has to be withdrawn before it starts the drive again. [SR-38] */
 #include "campaign/checkers/checker.h"
 
 #include "bench_variables.h"

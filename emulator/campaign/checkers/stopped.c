@@ -1,5 +1,5 @@
 /* State run is left, without a fault, only by a request to switch off, after a silence, at rest after a request to
- * stop, or by a request to run that is off because a bus-off has disarmed the drive. */
+ * stop, or by a request to run that is off because a bus-off has disarmed the drive. [SR-39] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,5 +1,5 @@
 /* A client that is silent has no torque made for it: from 65 ms after its last request on no larger one than before,
- * after 170 ms none. */
+ * after 170 ms none. [SR-04] [SR-05] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

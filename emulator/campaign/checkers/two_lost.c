@@ -1,4 +1,4 @@
-/* With two phases lost a drive does not run on for 300 ms at less than half of the commanded speed. */
+/* With two phases lost a drive does not run on for 300 ms at less than half of the commanded speed. [SR-31] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* In state run the link voltage is not below its threshold by 6 % for 3 ms. */
+/* In state run the link voltage is not below its threshold by 6 % for 3 ms. [SR-15] */
 #include "campaign/checkers/checker.h"
 
 #define PART 0.94

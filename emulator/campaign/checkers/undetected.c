@@ -1,5 +1,5 @@
 /* A drive in a run notices within its time what it can see at any time: changed memory, sensors at a rail, a wrong
- * clock, a background that hangs (fault_effects.c). */
+ * clock, a background that hangs (fault_effects.c). [SR-18] [SR-26] [SR-47] [SR-49] [SR-50] [SR-55] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,5 +1,5 @@
 /* With a fault of the bench, the bus or a client, the drive's first cause is one that this fault may have, or that is
- * true of the plant. */
+ * true of the plant. [SR-29] [SR-40] */
 #include "campaign/checkers/checker.h"
 #include "campaign/checkers/explanation.h"
 

@@ -1,4 +1,4 @@
-/* Speed, link voltage and largest current in the snapshot of a fault are the values at its instant. */
+/* Speed, link voltage and largest current in the snapshot of a fault are the values at its instant. [SR-40] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* At the end the hottest winding and the hottest switch are measured within 5 K. */
+/* At the end the hottest winding and the hottest switch are measured within 5 K. [SR-17] */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>

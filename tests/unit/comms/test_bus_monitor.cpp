@@ -1,4 +1,4 @@
-// Supervision of the CAN bus: waits and times at their limits, across the wrap of the clock.
+// Supervision of the CAN bus: waits and times at their limits, across the wrap of the clock. [SR-38]
 #include <cstdint>
 
 #include <gtest/gtest.h>
@@ -108,6 +108,7 @@ TEST_F(BusMonitor, the_first_wait_is_that_of_the_start_whatever_was_in_memory) {
     EXPECT_EQ(wait_us(), 10000u);
 }
 
+// [SR-37]
 TEST_F(BusMonitor, a_foreign_frame_is_a_conflict_for_a_second_after_the_last_one) {
     hal_can_frame_t frame{};
     frame.identifier = DRIVE_HEARTBEAT_FRAME_ID;
@@ -122,6 +123,7 @@ TEST_F(BusMonitor, a_foreign_frame_is_a_conflict_for_a_second_after_the_last_one
     EXPECT_EQ(monitor.foreign_count, 2);
 }
 
+// [SR-37]
 TEST_F(BusMonitor, neither_a_remote_nor_an_extended_frame_nor_another_identifier_is_a_conflict) {
     for (int kind = 0; kind < 4; kind++) {
         hal_can_frame_t frame{};

@@ -1,4 +1,4 @@
-// Received frames: each passes all checks or changes nothing but the counter of the check that rejected it.
+// Received frames: each passes all checks or changes nothing but the counter of the check that rejected it. [SR-32]
 #include <cmath>
 #include <cstring>
 #include <random>
@@ -95,6 +95,37 @@ TEST_F(Commands, a_reference_has_a_sign_and_is_symmetric) {
     }
 }
 
+TEST_F(Commands, a_position_command_has_its_order_and_target_and_each_is_a_new_one) {
+    const uint32_t before = command.position.sequence;
+    ASSERT_EQ(receive(frames::position_command(1, COMMAND_STOP, POSITION_ORDER_HALT, -(3 << 18))), COMMANDS_COMMAND);
+    EXPECT_EQ(command.request, COMMAND_STOP);
+    EXPECT_EQ(command.mode, DRIVE_MODE_POSITION);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+    EXPECT_EQ(command.position.target, -3 * POSITION_ONE_REV);
+    EXPECT_EQ(command.position.homing, POSITION_HOMING_METHODS) << "the parameter's";
+    EXPECT_EQ(command.position.sequence, before + 1);
+    ASSERT_EQ(receive(frames::position_command(2, COMMAND_STOP, POSITION_ORDER_HALT, -(3 << 18))), COMMANDS_COMMAND);
+    EXPECT_EQ(command.position.sequence, before + 2) << "an equal target is one more";
+}
+
+TEST_F(Commands, a_position_command_beyond_the_last_request_or_order_is_rejected) {
+    expect_rejected(frames::position_command(1, COMMAND_CLEAR_FAULT + 1, POSITION_ORDER_HALT, 0),
+                    &commands.counters.out_of_range);
+    expect_rejected(frames::position_command(2, COMMAND_OFF, POSITION_ORDER_HALT + 1, 0),
+                    &commands.counters.out_of_range);
+}
+
+// [SR-34]
+TEST_F(Commands, a_request_to_arm_of_an_armed_drive_is_refused_and_leaves_it_armed) {
+    arm(1, 10000);
+    const uint32_t challenge = commands.arming.challenge;
+    EXPECT_EQ(take(frames::arm(9, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 11000), COMMANDS_REJECTED);
+    EXPECT_TRUE(commands.arming.armed);
+    EXPECT_EQ(commands.arming.challenge, challenge) << "none is drawn";
+    EXPECT_EQ(commands.arming.attempt, ARMING_ATTEMPT_NONE);
+}
+
+// [SR-34]
 TEST_F(Commands, an_experiment_needs_arming_and_has_its_window) {
     ASSERT_EQ(receive(frames::identify_window(1, 0x1234, 0x56)), COMMANDS_COMMAND);
     ASSERT_EQ(receive(frames::identify_command(2, COMMAND_RUN, IDENTIFY_KIND_PULSE, 2, 9)), COMMANDS_COMMAND);
@@ -295,6 +326,7 @@ TEST_F(Commands, a_parameter_request_with_a_reserved_bit_is_rejected) {
     }
 }
 
+// [SR-05]
 TEST_F(Commands, after_a_timeout_a_sender_may_start_with_any_counter) {
     receive(command_frame(1), 5000);
     supervise(DRIVE_STATE_READY, 5000 + TIMEOUT_US);
@@ -303,6 +335,7 @@ TEST_F(Commands, after_a_timeout_a_sender_may_start_with_any_counter) {
     EXPECT_EQ(receive(command_frame(100), 5000 + TIMEOUT_US + 1), COMMANDS_COMMAND);
 }
 
+// [SR-05]
 TEST_F(Commands, a_command_of_either_message_restarts_the_timeout_of_both) {
     receive(command_frame(1), 0);
     receive(frames::torque_command(2, COMMAND_RUN, 0), TIMEOUT_US);
@@ -313,6 +346,7 @@ TEST_F(Commands, a_command_of_either_message_restarts_the_timeout_of_both) {
     EXPECT_EQ(receive(frames::torque_command(77, COMMAND_RUN, 0), 3 * TIMEOUT_US + 1), COMMANDS_COMMAND);
 }
 
+// [SR-05]
 TEST_F(Commands, the_timeout_is_measured_across_the_wrap_of_the_clock) {
     const uint32_t before_wrap = UINT32_MAX - 500;
     receive(command_frame(1), before_wrap);
@@ -322,6 +356,7 @@ TEST_F(Commands, the_timeout_is_measured_across_the_wrap_of_the_clock) {
     EXPECT_FALSE(commands.receiver.synchronised);
 }
 
+// [SR-05]
 TEST_F(Commands, rejected_frames_do_not_restart_the_timeout) {
     receive(command_frame(1), 0);
     hal_can_frame_t damaged = command_frame(2);
@@ -349,6 +384,7 @@ TEST_F(Commands, random_frames_are_rejected) {
     EXPECT_GE(commands.counters.wrong_checksum, 65535);
 }
 
+// [SR-34]
 TEST_F(Commands, a_run_is_off_until_the_drive_is_armed_and_then_takes_effect_at_once) {
     supervise(DRIVE_STATE_READY, 900);
     EXPECT_EQ(receive(command_frame(1), 1000), COMMANDS_COMMAND);
@@ -368,6 +404,7 @@ TEST_F(Commands, a_run_is_off_until_the_drive_is_armed_and_then_takes_effect_at_
     EXPECT_EQ(commands.arming.refused, 0);
 }
 
+// [SR-34]
 TEST_F(Commands, every_other_sequence_of_arming_is_refused) {
     const uint32_t challenge = 0x12345678;
     const auto refused = [&](uint8_t counter, unsigned step, uint32_t response, uint32_t after_us,
@@ -396,6 +433,7 @@ TEST_F(Commands, every_other_sequence_of_arming_is_refused) {
     refused(8, ARMING_STEP_CONFIRM_RUN, ~challenge, 1000, DRIVE_STATE_RUN);
 }
 
+// [SR-34]
 TEST_F(Commands, a_response_is_too_late_after_a_whole_round_of_the_clock_as_well) {
     take(command_frame(1), DRIVE_STATE_READY, 1000);
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
@@ -407,6 +445,7 @@ TEST_F(Commands, a_response_is_too_late_after_a_whole_round_of_the_clock_as_well
     EXPECT_FALSE(commands.arming.armed);
 }
 
+// [SR-34]
 TEST_F(Commands, arming_without_a_living_sender_of_commands_is_refused) {
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
     EXPECT_EQ(take(frames::arm(8, ARMING_STEP_CONFIRM_RUN, ~commands.arming.challenge), DRIVE_STATE_READY, 3000),
@@ -419,6 +458,7 @@ TEST_F(Commands, arming_without_a_living_sender_of_commands_is_refused) {
     EXPECT_FALSE(commands.arming.armed);
 }
 
+// [SR-34]
 TEST_F(Commands, a_recorded_command_after_a_reset_is_not_armed_by_the_living_sender_whose_own_was_refused_meanwhile) {
     take(command_frame(20), DRIVE_STATE_READY, 1000); // recorded
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
@@ -433,6 +473,7 @@ TEST_F(Commands, a_recorded_command_after_a_reset_is_not_armed_by_the_living_sen
     arm(uint8_t(counter + 1), 3000 + (counter - 26u) * 10000);
 }
 
+// [SR-34]
 TEST_F(Commands, a_recording_that_goes_on_after_a_reset_is_not_armed_by_the_living_sender_until_one_of_them_is_silent) {
     for (uint32_t silence_us : {COMMANDS_SENDER_LOST_US - 1, COMMANDS_SENDER_LOST_US}) {
         commands_init(&commands);
@@ -448,6 +489,7 @@ TEST_F(Commands, a_recording_that_goes_on_after_a_reset_is_not_armed_by_the_livi
     }
 }
 
+// [SR-34]
 TEST_F(Commands, a_recording_of_a_whole_sequence_arms_nothing) {
     hal.random = 99;
     const hal_can_frame_t recorded[] = {command_frame(1), frames::arm(7, ARMING_STEP_REQUEST_RUN),
@@ -468,6 +510,7 @@ TEST_F(Commands, a_recording_of_a_whole_sequence_arms_nothing) {
     EXPECT_GE(commands.arming.refused, 149);
 }
 
+// [SR-34]
 TEST_F(Commands, challenges_are_drawn_ten_milliseconds_apart_at_most) {
     const uint32_t first = hal.random;
     for (uint32_t time_us = 100000; time_us < 200000; time_us += 100) {
@@ -476,6 +519,7 @@ TEST_F(Commands, challenges_are_drawn_ten_milliseconds_apart_at_most) {
     EXPECT_EQ(hal.random - first, 10u);
 }
 
+// [SR-34]
 TEST_F(Commands, a_damaged_arming_frame_is_counted_and_changes_nothing) {
     for (unsigned bit = 0; bit < 8 * DRIVE_ARM_LENGTH; bit++) {
         hal_can_frame_t frame = frames::arm(7, ARMING_STEP_REQUEST_RUN);
@@ -496,6 +540,7 @@ TEST_F(Commands, a_damaged_arming_frame_is_counted_and_changes_nothing) {
     EXPECT_EQ(commands.arming.refused, 256 - ARMING_STEP_COUNT);
 }
 
+// [SR-52]
 TEST_F(Commands, a_bit_that_flips_in_what_arms_neither_arms_nor_leaves_armed) {
     for (const bool armed : {false, true}) {
         for (uint8_t *each : {&commands.arming.armed, &commands.arming.configuring}) {
@@ -515,6 +560,7 @@ TEST_F(Commands, a_bit_that_flips_in_what_arms_neither_arms_nor_leaves_armed) {
     }
 }
 
+// [SR-52]
 TEST_F(Commands, a_bit_that_flips_in_the_check_of_the_arming_disarms) {
     for (unsigned bit = 0; bit < 16; bit++) {
         commands_init(&commands);
@@ -525,6 +571,7 @@ TEST_F(Commands, a_bit_that_flips_in_the_check_of_the_arming_disarms) {
     }
 }
 
+// [SR-34]
 TEST_F(Commands, an_arming_for_configuration_that_ends_is_reported_and_one_that_there_is_not_does_not_end) {
     commands.arming.changed = false;
     arming_end_configuration(&commands.arming);
@@ -541,6 +588,7 @@ TEST_F(Commands, an_arming_for_configuration_that_ends_is_reported_and_one_that_
     EXPECT_TRUE(commands.arming.changed);
 }
 
+// [SR-35]
 TEST_F(Commands, what_disarms) {
     const auto disarms = [&](const auto &event) {
         commands_init(&commands);
@@ -578,6 +626,7 @@ TEST_F(Commands, what_disarms) {
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+// [SR-35]
 TEST_F(Commands, what_disarms_ends_an_attempt_to_arm_for_a_run_and_none_to_arm_for_configuration) {
     for (const bool run : {true, false}) {
         commands_init(&commands);
@@ -593,6 +642,7 @@ TEST_F(Commands, what_disarms_ends_an_attempt_to_arm_for_a_run_and_none_to_arm_f
     }
 }
 
+// [SR-32] [SR-56]
 TEST_F(Commands, a_frame_of_a_set_with_an_index_or_a_step_that_there_is_not_is_out_of_range) {
     const struct {
         bool control;
@@ -615,6 +665,7 @@ TEST_F(Commands, a_frame_of_a_set_with_an_index_or_a_step_that_there_is_not_is_o
     }
 }
 
+// [SR-34]
 TEST_F(Commands, an_arming_begins_without_errors_use_or_run_of_the_one_before) {
     arm(1, 10000);
     for (unsigned i = 0; i + 1 < COMMANDS_ERRORS_MAX; i++) {
@@ -641,6 +692,7 @@ TEST_F(Commands, an_arming_begins_without_errors_use_or_run_of_the_one_before) {
     EXPECT_TRUE(commands.arming.armed);
 }
 
+// [SR-34]
 TEST_F(Commands, a_frame_that_comes_twice_does_not_prevent_the_arming) {
     take(command_frame(1), DRIVE_STATE_READY, 1000);
     EXPECT_EQ(take(command_frame(1), DRIVE_STATE_READY, 2000), COMMANDS_REJECTED);
@@ -650,6 +702,7 @@ TEST_F(Commands, a_frame_that_comes_twice_does_not_prevent_the_arming) {
     EXPECT_TRUE(commands.arming.armed);
 }
 
+// [SR-34] [SR-36]
 TEST_F(Commands, a_second_sender_of_71_minutes_ago_does_not_prevent_the_arming) {
     take(command_frame(1), DRIVE_STATE_READY, 1000);
     EXPECT_EQ(take(command_frame(50), DRIVE_STATE_READY, 2000), COMMANDS_REJECTED);
@@ -662,6 +715,7 @@ TEST_F(Commands, a_second_sender_of_71_minutes_ago_does_not_prevent_the_arming) 
               COMMANDS_COMMAND);
 }
 
+// [SR-35]
 TEST_F(Commands, armed_without_a_request_to_run_lasts_half_a_second) {
     take(command_frame(0, COMMAND_OFF), DRIVE_STATE_READY, 1000);
     take(frames::arm(7, ARMING_STEP_REQUEST_RUN), DRIVE_STATE_READY, 2000);
@@ -676,6 +730,7 @@ TEST_F(Commands, armed_without_a_request_to_run_lasts_half_a_second) {
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+// [SR-33]
 TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     hal_can_frame_t damaged = command_frame(50), too_short = command_frame(50);
     damaged.data[5] ^= 1;
@@ -700,6 +755,7 @@ TEST_F(Commands, four_bad_frames_in_succession_are_a_fault_and_three_are_none) {
     EXPECT_TRUE(commands.failed);
 }
 
+// [SR-33]
 TEST_F(Commands, bad_frames_among_enough_good_ones_never_add_up) {
     arm(1, 10000);
     uint8_t counter = 1;
@@ -721,6 +777,7 @@ TEST_F(Commands, bad_frames_among_enough_good_ones_never_add_up) {
     EXPECT_TRUE(commands.arming.armed);
 }
 
+// [SR-33]
 TEST_F(Commands, a_valid_command_behind_the_last_bad_one_is_only_counted_until_the_run_has_ended) {
     arm(1, 10000);
     for (int i = 0; i < 4; i++) {
@@ -735,6 +792,7 @@ TEST_F(Commands, a_valid_command_behind_the_last_bad_one_is_only_counted_until_t
     EXPECT_EQ(command.request, COMMAND_OFF);
 }
 
+// [SR-33]
 TEST_F(Commands, duplicated_frames_are_dropped_and_counted_but_are_no_second_sender) {
     arm(0, 10000);
     uint32_t time_us = 10000;
@@ -757,6 +815,7 @@ TEST_F(Commands, duplicated_frames_are_dropped_and_counted_but_are_no_second_sen
     EXPECT_TRUE(commands.failed);
 }
 
+// [SR-33]
 TEST_F(Commands, bad_frames_are_no_fault_while_not_armed) {
     for (int i = 0; i < 100; i++) {
         hal_can_frame_t damaged = command_frame(1);
@@ -768,6 +827,7 @@ TEST_F(Commands, bad_frames_are_no_fault_while_not_armed) {
     EXPECT_EQ(commands.errors, 0) << "those before the arming do not count";
 }
 
+// [SR-36]
 TEST_F(Commands, a_second_sender_neither_takes_over_nor_goes_unnoticed) {
     // 100 frames per second of the first, with lost ones; frames of the second per frame of the first.
     for (const double ratio : {10.0, 4.0, 1.0, 0.3, 0.1, 0.02}) {
@@ -800,6 +860,7 @@ TEST_F(Commands, a_second_sender_neither_takes_over_nor_goes_unnoticed) {
     }
 }
 
+// [SR-36]
 TEST_F(Commands, three_recorded_frames_beside_the_living_sender_end_the_run) {
     arm(100, 10000);
     uint8_t counter = 100;
@@ -815,6 +876,7 @@ TEST_F(Commands, three_recorded_frames_beside_the_living_sender_end_the_run) {
     EXPECT_EQ(taken_over, 0);
 }
 
+// [SR-36]
 TEST_F(Commands, recorded_frames_in_their_order_do_not_replace_a_sender_that_lives_nor_clear_a_fault) {
     uint8_t counter = 100;
     for (uint32_t time_us = 20000; time_us < 1000000; time_us += 10000) {
@@ -827,6 +889,7 @@ TEST_F(Commands, recorded_frames_in_their_order_do_not_replace_a_sender_that_liv
     }
 }
 
+// [SR-36]
 TEST_F(Commands, another_sender_is_followed_after_30_ms_of_silence_with_its_third_frame) {
     take(command_frame(100, COMMAND_OFF, 0), DRIVE_STATE_READY, 20000);
     uint8_t counter = 20;
@@ -838,6 +901,7 @@ TEST_F(Commands, another_sender_is_followed_after_30_ms_of_silence_with_its_thir
     EXPECT_EQ(time_us, 20000u + COMMANDS_SENDER_LOST_US + 2 * 10000u);
 }
 
+// [SR-33]
 TEST_F(Commands, ordinary_loss_is_no_error) {
     std::mt19937 random(3);
     arm(0, 10000);

@@ -1,4 +1,4 @@
-// End-to-end protection: published check value, every pair of counters, corrupted frames, resynchronisation.
+// End-to-end protection: published check value, every pair of counters, corrupted frames, resynchronisation. [SR-32]
 #include <array>
 #include <cstring>
 #include <random>
@@ -89,6 +89,7 @@ TEST(E2e, a_jump_within_the_jump_counts_from_one_again) {
     EXPECT_EQ(receiver.take(203), E2E_RESYNCHRONISED);
 }
 
+// [SR-36]
 TEST(E2e, a_replayed_sequence_is_refused_while_the_true_sender_lives) {
     receiver_t receiver;
     receiver.take(0);
@@ -98,6 +99,7 @@ TEST(E2e, a_replayed_sequence_is_refused_while_the_true_sender_lives) {
     }
 }
 
+// [SR-36]
 TEST(E2e, a_locked_receiver_stays_with_its_sender) {
     receiver_t receiver;
     receiver.take(10);
@@ -111,6 +113,7 @@ TEST(E2e, a_locked_receiver_stays_with_its_sender) {
     EXPECT_EQ(receiver.take(200), E2E_ACCEPTED);
 }
 
+// [SR-36]
 TEST(E2e, messages_with_one_receiver_have_one_sequence) {
     receiver_t receiver;
     receiver.take(10);
@@ -141,6 +144,7 @@ TEST(E2e, only_an_exact_repetition_of_the_last_accepted_frame_is_a_repeated_one)
     }
 }
 
+// [SR-36]
 TEST(E2e, the_last_frame_once_more_is_no_sender_that_starts_again) {
     receiver_t receiver;
     receiver.take(10);
@@ -201,6 +205,7 @@ TEST(E2e, every_one_and_two_bit_error_is_found) {
     }
 }
 
+// [SR-36]
 TEST(E2e, restart_hears_a_sender_that_starts_again) {
     receiver_t receiver;
     receiver.take(10);
@@ -208,6 +213,26 @@ TEST(E2e, restart_hears_a_sender_that_starts_again) {
     e2e_receiver_restart(&receiver);
     EXPECT_EQ(receiver.take(200), E2E_ACCEPTED);
     EXPECT_EQ(receiver.take(101), E2E_WRONG_SEQUENCE);
+}
+
+// [SR-36]
+TEST(E2e, restart_ends_the_lock_so_that_a_later_jump_is_believed_again) {
+    receiver_t receiver;
+    receiver.take(10);
+    receiver.locked = true;
+    e2e_receiver_restart(&receiver);
+    receiver.take(20);
+    receiver.take(100);
+    receiver.take(101);
+    EXPECT_EQ(receiver.take(102), E2E_RESYNCHRONISED);
+}
+
+TEST(E2e, a_frame_of_the_header_alone_has_a_checksum_like_any_other) {
+    uint8_t header[E2E_HEADER_BYTES] = {};
+    e2e_protect(DATA_ID, 7, header, sizeof header);
+    EXPECT_TRUE(e2e_checksum_matches(DATA_ID, header, sizeof header));
+    header[E2E_HEADER_BYTES - 1] ^= 1;
+    EXPECT_FALSE(e2e_checksum_matches(DATA_ID, header, sizeof header));
 }
 
 } // namespace

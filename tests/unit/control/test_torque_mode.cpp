@@ -80,6 +80,7 @@ TEST(TorqueMode, the_smallest_slew_rate_still_moves) {
     EXPECT_EQ(mode.torque_q24, 1);
 }
 
+// [SR-08]
 TEST(TorqueMode, full_torque_below_seven_eighths_of_the_over_speed_limit_and_none_above_fifteen_sixteenths) {
     const torque_mode_parameters_t parameters = configured(0.0);
     const int32_t limit_q24 = to_fixed(TORQUE_MAX_NM, Q24);

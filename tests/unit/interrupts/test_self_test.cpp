@@ -1,4 +1,5 @@
 // Checks that the drive makes of itself: every one passes, and every change of what it looks at makes it fail in time.
+// [SR-50]
 #include <algorithm>
 #include <array>
 #include <cstring>
@@ -108,6 +109,7 @@ class SelfTest : public testing::Test {
     uint32_t time_us = UINT32_MAX - 1000000; // the clock wraps meanwhile
 };
 
+// [SR-54]
 TEST_F(SelfTest, passes_and_counts_its_passes_over_the_code_and_the_words_of_stack_that_were_never_used) {
     run(4000000);
     EXPECT_EQ(test.failed, 0u);
@@ -116,6 +118,7 @@ TEST_F(SelfTest, passes_and_counts_its_passes_over_the_code_and_the_words_of_sta
     EXPECT_EQ(test.stack_unused, 700u);
 }
 
+// [SR-49]
 TEST_F(SelfTest, every_bit_of_every_limit_fails_in_the_next_call) {
     auto *bytes = reinterpret_cast<uint8_t *>(&constants.protection);
     for (unsigned bit = 0; bit < 8 * sizeof constants.protection; bit++) {
@@ -142,6 +145,7 @@ TEST_F(SelfTest, every_bit_of_the_constants_fails_within_two_passes) {
     EXPECT_LT(2 * pass_us, 2000u);
 }
 
+// [SR-57]
 TEST_F(SelfTest, every_bit_of_the_parameters_fails_within_a_millisecond) {
     begin();
     const parameters_t right = parameters;
@@ -167,6 +171,7 @@ TEST_F(SelfTest, new_constants_in_the_middle_of_a_pass_are_no_change) {
     EXPECT_EQ(test.failed, 0u);
 }
 
+// [SR-53]
 TEST_F(SelfTest, a_bit_of_the_code_fails_within_two_passes_and_at_the_start_at_once) {
     std::mt19937 random(2);
     for (unsigned k = 0; k < 20; k++) {
@@ -184,6 +189,7 @@ TEST_F(SelfTest, a_bit_of_the_code_fails_within_two_passes_and_at_the_start_at_o
     }
 }
 
+// [SR-53]
 TEST_F(SelfTest, a_place_beyond_the_last_word_ends_the_pass) {
     for (unsigned bit = 12; bit < 32; bit++) {
         for (const bool code_word : {false, true}) {
@@ -201,6 +207,7 @@ TEST_F(SelfTest, a_place_beyond_the_last_word_ends_the_pass) {
     }
 }
 
+// [SR-54]
 TEST_F(SelfTest, a_used_guard_word_fails_in_the_next_call) {
     stack[0] = 0;
     EXPECT_EQ(run(1000000), PERIOD_US);
@@ -208,6 +215,7 @@ TEST_F(SelfTest, a_used_guard_word_fails_in_the_next_call) {
     EXPECT_EQ(self_test_faults(&test), FAULT_BIT(FAULT_MEMORY));
 }
 
+// [SR-54]
 TEST_F(SelfTest, a_changed_register_fails_within_a_millisecond_and_stays_failed) {
     hal.registers_intact = false;
     EXPECT_LE(run(1000000), SELF_TEST_STEP_US);
@@ -218,6 +226,7 @@ TEST_F(SelfTest, a_changed_register_fails_within_a_millisecond_and_stays_failed)
     EXPECT_EQ(self_test_faults(&test), FAULT_BIT(FAULT_MEMORY));
 }
 
+// [SR-55]
 TEST_F(SelfTest, clocks_that_differ_by_more_than_5_percent_fail_within_two_intervals_and_others_do_not) {
     for (const double rate : {0.0, 0.5, 0.93, 0.945, 1.055, 1.07, 2.0}) {
         begin();
@@ -231,6 +240,7 @@ TEST_F(SelfTest, clocks_that_differ_by_more_than_5_percent_fail_within_two_inter
     }
 }
 
+// [SR-55]
 TEST_F(SelfTest, the_clocks_may_differ_by_exactly_5_percent_of_the_interval_and_by_no_microsecond_more) {
     const uint32_t tolerance_us = SELF_TEST_CLOCK_US / 20;
     const struct {
@@ -252,6 +262,7 @@ TEST_F(SelfTest, the_clocks_may_differ_by_exactly_5_percent_of_the_interval_and_
     }
 }
 
+// [SR-55]
 TEST_F(SelfTest, the_clock_passes_again_when_it_is_right) {
     begin();
     run(1000000, 1.1);
@@ -264,6 +275,7 @@ TEST_F(SelfTest, the_clock_passes_again_when_it_is_right) {
     EXPECT_EQ(test.failed, 0u);
 }
 
+// [SR-55]
 TEST_F(SelfTest, the_clock_passes_when_interrupts_hold_the_background_between_the_pass_and_its_reading) {
     begin();
     for (unsigned k = 0; k < 10000; k++) {
@@ -277,6 +289,7 @@ TEST_F(SelfTest, the_clock_passes_when_interrupts_hold_the_background_between_th
     }
 }
 
+// [SR-53]
 TEST_F(SelfTest, a_port_without_code_and_stack_passes) {
     hal.memory = {};
     begin();
@@ -285,6 +298,7 @@ TEST_F(SelfTest, a_port_without_code_and_stack_passes) {
     EXPECT_EQ(test.code_passes, 0u);
 }
 
+// [SR-51]
 TEST_F(SelfTest, a_latch_is_intact_only_when_number_mask_and_state_agree) {
     control_state_t control{};
     state_machine_t &machine = control.state_machine;
@@ -311,6 +325,7 @@ TEST_F(SelfTest, a_latch_is_intact_only_when_number_mask_and_state_agree) {
     }
 }
 
+// [SR-51]
 TEST_F(SelfTest, duties_outside_of_a_run_are_those_of_a_changed_state) {
     control_state_t control{};
     for (unsigned phase = 0; phase < HAL_PHASES_MAX; phase++) {

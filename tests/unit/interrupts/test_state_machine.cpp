@@ -1,4 +1,4 @@
-// Every state with every input, and the conditions for a restart after a fault.
+// Every state with every input, and the conditions for a restart after a fault. [SR-39]
 #include <cstdint>
 #include <vector>
 
@@ -155,6 +155,7 @@ class StateMachine : public testing::Test {
     state_machine_t state_machine;
 };
 
+// [SR-43]
 TEST_F(StateMachine, initialise_lasts_until_all_checks_have_passed_for_its_time_without_interruption) {
     for (uint32_t k = 0; k + 1 < INITIALISE_TICKS; k++) {
         ASSERT_EQ(step(COMMAND_OFF), DRIVE_STATE_INITIALISE);
@@ -167,6 +168,7 @@ TEST_F(StateMachine, initialise_lasts_until_all_checks_have_passed_for_its_time_
     EXPECT_EQ(step(COMMAND_OFF, TIMEOUT), DRIVE_STATE_READY);
 }
 
+// [SR-43]
 TEST_F(StateMachine, the_check_that_holds_initialise_is_known_and_none_is_afterwards) {
     const uint64_t failed = FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_OVER_SPEED);
     step(COMMAND_RUN, failed | TIMEOUT);
@@ -181,6 +183,7 @@ TEST_F(StateMachine, the_check_that_holds_initialise_is_known_and_none_is_afterw
     EXPECT_EQ(state_machine.start_inhibit_mask, 0u) << "a fault is one by itself";
 }
 
+// [SR-42]
 TEST_F(StateMachine, a_run_request_from_power_on_does_not_start_the_drive) {
     for (int k = 0; k < 100; k++) {
         ASSERT_NE(step(COMMAND_RUN), DRIVE_STATE_RUN);
@@ -222,6 +225,7 @@ TEST(StateMachineExperiments, they_begin_in_ready_alone_and_end_with_every_other
     EXPECT_FALSE(machine.rearmed) << "a request that persists does not begin again";
 }
 
+// [SR-05] [SR-39]
 TEST_F(StateMachine, a_command_timeout_is_a_fault_in_run_only) {
     for (uint32_t k = 0; k < INITIALISE_TICKS; k++) {
         step(COMMAND_OFF, TIMEOUT);
@@ -233,6 +237,15 @@ TEST_F(StateMachine, a_command_timeout_is_a_fault_in_run_only) {
     EXPECT_EQ(state_machine.record.fault, FAULT_COMMAND_TIMEOUT);
 }
 
+// [SR-40]
+TEST(StateMachineTable, the_first_fault_of_a_mask_is_the_lowest_bit_of_all_64) {
+    EXPECT_EQ(state_machine_first_fault(0), FAULT_NONE);
+    for (unsigned bit = 0; bit < 64; bit++) {
+        EXPECT_EQ(unsigned(state_machine_first_fault(UINT64_MAX << bit)), bit);
+    }
+}
+
+// [SR-40]
 TEST_F(StateMachine, the_record_keeps_the_first_fault) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_SPEED) | FAULT_BIT(FAULT_ENCODER));
@@ -247,6 +260,7 @@ TEST_F(StateMachine, the_record_keeps_the_first_fault) {
     EXPECT_EQ(state_machine.record.fault, FAULT_NONE);
 }
 
+// [SR-42]
 TEST_F(StateMachine, after_a_fault_the_run_request_must_be_withdrawn_before_a_restart) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -260,6 +274,7 @@ TEST_F(StateMachine, after_a_fault_the_run_request_must_be_withdrawn_before_a_re
     EXPECT_EQ(step(COMMAND_RUN), DRIVE_STATE_RUN);
 }
 
+// [SR-41]
 TEST_F(StateMachine, a_persistent_clear_fault_clears_only_once) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -271,8 +286,32 @@ TEST_F(StateMachine, a_persistent_clear_fault_clears_only_once) {
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT, FAULT_BIT(FAULT_ENCODER)), DRIVE_STATE_FAULT);
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "a later fault is not cleared";
+    wait_until_the_cause_is_gone(COMMAND_CLEAR_FAULT);
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_FAULT) << "nor one that has failed in a single tick";
 }
 
+// [SR-40]
+TEST_F(StateMachine, a_fault_that_is_cleared_leaves_nothing_in_the_record) {
+    run();
+    step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    fault_record_t &record = state_machine.record;
+    record.time_us = 1; // as the caller completes it
+    record.speed_q22 = record.torque_reference_q24 = -2;
+    record.current_max_q9 = record.dc_link_voltage_q6 = 3;
+    step(COMMAND_OFF);
+    wait_until_the_cause_is_gone();
+    ASSERT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+    EXPECT_EQ(record.fault, FAULT_NONE);
+    EXPECT_EQ(record.fault_mask, 0u);
+    EXPECT_EQ(record.time_us, 0u);
+    EXPECT_EQ(record.speed_q22, 0);
+    EXPECT_EQ(record.torque_reference_q24, 0);
+    EXPECT_EQ(record.current_max_q9, 0);
+    EXPECT_EQ(record.dc_link_voltage_q6, 0);
+    EXPECT_EQ(record.state, 0);
+}
+
+// [SR-41]
 TEST_F(StateMachine, a_fault_is_cleared_when_its_cause_has_been_gone_for_ten_milliseconds) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -283,6 +322,7 @@ TEST_F(StateMachine, a_fault_is_cleared_when_its_cause_has_been_gone_for_ten_mil
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY) << "the request waits";
 }
 
+// [SR-41]
 TEST_F(StateMachine, ten_milliseconds_begin_after_the_fault_itself_when_it_lasts_one_tick) {
     for (const drive_state_t from : {DRIVE_STATE_READY, DRIVE_STATE_RUN}) {
         state_machine_reset(&state_machine);
@@ -300,6 +340,7 @@ TEST_F(StateMachine, ten_milliseconds_begin_after_the_fault_itself_when_it_lasts
     }
 }
 
+// [SR-41]
 TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_request_to_clear) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -315,6 +356,7 @@ TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_re
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
 }
 
+// [SR-42]
 TEST_F(StateMachine, a_recurring_fault_requires_the_run_request_to_be_withdrawn_again) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -327,6 +369,7 @@ TEST_F(StateMachine, a_recurring_fault_requires_the_run_request_to_be_withdrawn_
     EXPECT_FALSE(state_machine.rearmed);
 }
 
+// [SR-06]
 TEST_F(StateMachine, a_stop_runs_until_standstill_and_off_does_not_wait) {
     run();
     for (int k = 0; k < 10; k++) {
@@ -337,6 +380,7 @@ TEST_F(StateMachine, a_stop_runs_until_standstill_and_off_does_not_wait) {
     EXPECT_EQ(step(COMMAND_OFF), DRIVE_STATE_READY);
 }
 
+// [SR-39] [SR-51]
 TEST_F(StateMachine, a_run_that_finds_a_request_to_clear_has_begun_by_itself_and_ends) {
     run();
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);

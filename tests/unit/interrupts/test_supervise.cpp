@@ -1,4 +1,4 @@
-// Supervision step: the record of a fault, and what a change of the state leaves of a run and of its load.
+// Supervision step: the record of a fault, and what a change of the state leaves of a run and of its load. [SR-44]
 #include <algorithm>
 #include <cstdint>
 
@@ -47,6 +47,7 @@ class Supervise : public testing::Test {
     command_t command{};
 };
 
+// [SR-40]
 TEST_F(Supervise, every_value_of_the_record_is_that_of_the_sample_which_failed) {
     sample.time_us = 0xFEDCBA98u;
     state.torque_reference_q24 = -123456789;
@@ -76,6 +77,7 @@ TEST_F(Supervise, every_value_of_the_record_is_that_of_the_sample_which_failed) 
     }
 }
 
+// [SR-40]
 TEST_F(Supervise, the_record_of_a_fault_is_not_overwritten_by_later_samples) {
     sample.time_us = 10;
     tick(COMMAND_RUN, OVER_VOLTAGE);
@@ -182,6 +184,7 @@ TEST_F(Supervise, an_observer_as_wide_as_after_its_reset_takes_nothing_for_a_loa
     }
 }
 
+// [SR-06]
 TEST_F(Supervise, a_stop_ends_below_half_a_radian_per_second_in_either_direction) {
     for (const int32_t direction : {-1, 1}) {
         reset(DRIVE_STATE_RUN);

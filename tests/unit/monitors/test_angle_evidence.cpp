@@ -1,4 +1,4 @@
-// Encoder against flux linkage, on a phase whose state is known exactly.
+// Encoder against flux linkage, on a phase whose state is known exactly. [SR-22]
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -129,6 +129,7 @@ class AngleEvidence : public testing::Test {
     uint32_t spacing = 1; // periods between samples
 };
 
+// [SR-21]
 TEST_F(AngleEvidence, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf_after_2_degrees) {
     // Saturating: 0.34 Wb aligned less 0.017 unaligned at 26 A over pi / 4; 8.2 rad/s after 2 degrees at 955 rad/s^2.
     const double volts = parameters.flux_error_q29 / Q29 / PERIOD_S;
@@ -136,6 +137,7 @@ TEST_F(AngleEvidence, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf
     EXPECT_LT(volts, 1.9);
 }
 
+// [SR-21]
 TEST_F(AngleEvidence, a_rotor_that_accelerates_while_the_encoder_does_not_count_is_found_after_1_to_4_degrees) {
     for (const double start_deg : {55.0, 65.0, 75.0}) {
         monitor = {};
@@ -156,6 +158,7 @@ TEST_F(AngleEvidence, a_rotor_that_accelerates_while_the_encoder_does_not_count_
     }
 }
 
+// [SR-21]
 TEST_F(AngleEvidence, a_rotor_at_rest_is_no_evidence_whatever_the_current_and_a_gain_of_the_sensor) {
     for (const double gain : {0.95, 1.0, 1.05}) {
         monitor = {};
@@ -275,6 +278,7 @@ TEST_F(AngleEvidence, a_phase_has_company_while_another_has_contradicted_the_ang
     EXPECT_FALSE(suspects(1));
 }
 
+// [SR-21]
 TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_frozen_encoder) {
     // By the link voltage's 6 mWb a period: of an open winding nearly all; of a rotor that turns at a twentieth of the
     // speed of full back-EMF a twentieth.
@@ -295,7 +299,7 @@ TEST_F(AngleEvidence, integral_that_parts_faster_than_a_rotor_can_turn_is_no_fro
     }
 }
 
-// At nine tenths of the tolerated error of the voltage, for longer than the time constant of the leak.
+// At nine tenths of the tolerated error of the voltage, for longer than the time constant of the leak. [SR-21]
 TEST_F(AngleEvidence, an_integral_that_drifts_by_less_than_the_tolerated_error_for_long_is_no_frozen_encoder) {
     for (const auto &[part, frozen] : {std::pair{0.9, false}, std::pair{-0.9, false}, std::pair{2.0, true}}) {
         monitor = {};
@@ -307,6 +311,7 @@ TEST_F(AngleEvidence, an_integral_that_drifts_by_less_than_the_tolerated_error_f
     }
 }
 
+// [SR-21]
 TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_frozen_encoder) {
     for (const bool jumps : {true, false}) {
         monitor = {};
@@ -320,6 +325,34 @@ TEST_F(AngleEvidence, integral_that_jumps_after_the_current_has_fallen_is_no_fro
     }
 }
 
+// A sensor that fails for a sample: its current moves, the integral of the voltage does not. [SR-22] [SR-30]
+TEST_F(AngleEvidence, a_current_that_moves_without_a_voltage_is_no_evidence_until_the_phase_was_without_current) {
+    for (const bool fails : {true, false}) {
+        monitor = {};
+        input.zero_at[0] = input.period;
+        const auto contradicted = [&](bool wrong) {
+            for (int k = 0; k < (wrong ? 240 : 20); k++) {
+                step(wrong ? 77.0 : 65.0, 65.0, 25.0);
+            }
+            return (monitor.evidence.contradicts & 1u) != 0;
+        };
+        EXPECT_FALSE(contradicted(false));
+        if (fails) {
+            const int32_t flux_q29 = input.flux_q29[0];
+            step(65.0, 65.0, 8.0);
+            flux_offset_q29 = flux_q29 - input.flux_q29[0];
+            step(65.0, 65.0, 8.0);
+            flux_offset_q29 = 0;
+            step(65.0, 65.0, 25.0);
+        }
+        EXPECT_EQ(contradicted(true), !fails);
+        monitor.state.phase[0].shown = false;
+        input.zero_at[0] = input.period;
+        EXPECT_TRUE(contradicted(true)) << fails;
+    }
+}
+
+// [SR-22] [SR-30]
 TEST_F(AngleEvidence, flux_linkage_that_a_warm_or_a_cold_winding_explains_does_not_contradict_the_angle) {
     const struct {
         double excess_Wb, drop_Wb;
@@ -339,6 +372,7 @@ TEST_F(AngleEvidence, flux_linkage_that_a_warm_or_a_cold_winding_explains_does_n
     }
 }
 
+// [SR-21] [SR-30]
 TEST_F(AngleEvidence, an_integral_that_drifts_by_a_warm_or_a_cold_winding_is_no_frozen_encoder) {
     resistance_period_q40 = int32_t(0.4 * PERIOD_S * 0x1p40); // 10 V at 25 A
     for (const auto &[factor, frozen] : {std::pair{0.4, true}, {0.72, false}, {1.55, false}, {2.3, true}}) {
@@ -351,6 +385,7 @@ TEST_F(AngleEvidence, an_integral_that_drifts_by_a_warm_or_a_cold_winding_is_no_
     }
 }
 
+// [SR-22] [SR-30]
 TEST_F(AngleEvidence, flux_linkage_that_no_angle_explains_is_no_error_of_the_encoder) {
     // Aligned, 25 A are 0.34 Wb; the integral of two phases says far more, or less than unaligned.
     for (const double excess_Wb : {0.35, -0.3}) {
@@ -482,7 +517,7 @@ TEST_F(AngleEvidence, of_four_phases_two_that_have_agreed_speak_for_the_encoder_
     }
 }
 
-// The flux linkage of an integral that parts by a twentieth of the DC-link voltage.
+// The flux linkage of an integral that parts by a twentieth of the DC-link voltage. [SR-21]
 TEST_F(AngleEvidence, an_integral_that_parts_from_its_first_sample_on_is_found_as_soon_as_one_that_does_so_later) {
     int first = 0;
     for (const int begins : {1, 200}) {

@@ -1,4 +1,4 @@
-// Available torque: the smallest limit of each direction is named, exactly.
+// Available torque: the smallest limit of each direction is named, exactly. [SR-09]
 #include <gtest/gtest.h>
 
 extern "C" {
@@ -51,6 +51,7 @@ TEST(AvailableTorque, each_direction_has_the_voltage_limit_of_its_own) {
     expect_side(available.backward, 3 << 24, TORQUE_LIMIT_VOLTAGE);
 }
 
+// [SR-09] [SR-14]
 TEST(AvailableTorque, the_link_limits_the_torque_against_the_speed_only) {
     for (const int32_t speed_q22 : {SPEED_Q22, -SPEED_Q22}) {
         available_torque_input_t input = healthy();
@@ -63,6 +64,7 @@ TEST(AvailableTorque, the_link_limits_the_torque_against_the_speed_only) {
     }
 }
 
+// [SR-09] [SR-14]
 TEST(AvailableTorque, a_link_that_fills_up_is_named_for_what_the_voltage_takes_against_the_speed) {
     available_torque_input_t input = healthy();
     input.link_fills = true;

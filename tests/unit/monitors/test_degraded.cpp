@@ -1,4 +1,4 @@
-// Degraded running: which loss of a phase is accepted, and the torque that remains. Machine: saturating.
+// Degraded running: which loss of a phase is accepted, and the torque that remains. Machine: saturating. [SR-31]
 #include <cmath>
 #include <cstdint>
 
@@ -51,6 +51,19 @@ TEST_F(Degraded, nothing_else_is_accepted) {
     ASSERT_TRUE(degraded_accepts(&parameters, &degraded, true, OPEN, 2u));
     EXPECT_FALSE(degraded_accepts(&parameters, &degraded, true, OPEN, 4u));
     EXPECT_EQ(degraded.lost, 2u);
+}
+
+TEST_F(Degraded, a_phase_has_no_torque_before_its_turn_on_angle_nor_from_its_turn_off_angle_on) {
+    parameters.window = {0xA0000000u, 0x30000000u};
+    degraded.lost = 6u; // phase 0 alone
+    const auto torque = [this](uint32_t electrical) {
+        return degraded_torque_q24(&parameters, &degraded, &machine_tables, electrical);
+    };
+    EXPECT_EQ(torque(0xA0000000u - 1u), 0);
+    EXPECT_GT(torque(0xA0000000u), 0);
+    EXPECT_GT(torque(0xD0000000u - 1u), 0);
+    EXPECT_EQ(torque(0xD0000000u), 0);
+    EXPECT_EQ(torque(0x40000000u), 0) << "beyond the aligned position it would brake";
 }
 
 TEST_F(Degraded, the_torque_that_remains_is_the_sum_of_the_others_at_the_current_limit) {

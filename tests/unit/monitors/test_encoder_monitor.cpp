@@ -1,4 +1,4 @@
-// Encoder against its own counts.
+// Encoder against its own counts. [SR-07]
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -41,6 +41,7 @@ class EncoderMonitor : public testing::Test {
     flux_sample_t &input = residual.sample;
 };
 
+// [SR-23]
 TEST_F(EncoderMonitor,
        an_encoder_that_turns_round_within_a_millisecond_is_suspect_and_a_rotor_that_does_so_in_ten_is_not) {
     for (const int turning_ms : {0, 10}) { // between 300 r/min one way and the other
@@ -58,6 +59,7 @@ TEST_F(EncoderMonitor,
     }
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor,
        a_rotor_that_turns_by_more_than_half_a_turn_while_triggers_are_lost_is_no_encoder_that_turns_round) {
     for (const bool lost : {true, false}) {
@@ -73,6 +75,7 @@ TEST_F(EncoderMonitor,
     }
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor, an_encoder_that_turns_the_other_way_after_triggers_were_lost_has_not_turned_round) {
     for (const bool lost : {true, false}) {
         monitor = {};
@@ -87,6 +90,7 @@ TEST_F(EncoderMonitor, an_encoder_that_turns_the_other_way_after_triggers_were_l
     }
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_turn_round) {
     monitor = {};
     input.periods = 0;
@@ -97,6 +101,7 @@ TEST_F(EncoderMonitor, the_first_direction_of_the_encoder_after_a_reset_is_no_tu
     EXPECT_FALSE(monitor.turned_round);
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor, a_rotor_that_is_light_enough_to_turn_round_within_a_millisecond_is_not_suspect) {
     // Between 300 r/min one way and the other, 1800 degrees a second: in 1.4 ms by 2.5e6 degrees/s^2.
     for (const auto &[deg_s2, suspect] : {std::pair{2.8e6, false}, std::pair{2.2e6, true}}) {
@@ -178,6 +183,7 @@ TEST_F(EncoderMonitor, a_jump_that_the_observer_follows_to_any_speed_is_no_over_
     }
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor,
        an_encoder_that_has_turned_round_is_suspect_for_a_quarter_of_a_second_each_time_and_never_again) {
     double angle_deg = 0.0, speed_deg_s = 1800.0;
@@ -206,6 +212,7 @@ TEST_F(EncoderMonitor,
     EXPECT_EQ(run(RATE_HZ / 10), 0u);
 }
 
+// [SR-23]
 TEST_F(EncoderMonitor, a_rotor_that_turns_the_other_way_after_a_rest_is_no_encoder_that_turns_round) {
     double angle_deg = 100.0;
     const auto turn = [&](double deg_s, uint32_t periods) {
@@ -265,6 +272,7 @@ TEST_F(EncoderWindows, the_observer_s_speed_counts_above_the_limit_and_not_at_it
     }
 }
 
+// [SR-23]
 TEST_F(EncoderWindows,
        an_encoder_that_rests_for_two_windows_between_its_directions_has_turned_round_and_for_three_not) {
     for (const int sign : {1, -1}) {

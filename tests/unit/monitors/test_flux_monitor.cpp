@@ -1,4 +1,4 @@
-// The table of verdicts: precedence, and what each row needs.
+// The table of verdicts: precedence, and what each row needs. [SR-29]
 #include <algorithm>
 #include <cstdint>
 #include <functional>
@@ -76,6 +76,7 @@ TEST(FluxMonitor, nothing_is_the_verdict_without_evidence) {
     EXPECT_EQ(flux_monitor_verdict(&none, 0), FAULT_NONE);
 }
 
+// [SR-23] [SR-29]
 TEST(FluxMonitor, a_fault_of_a_phase_is_the_encoder_s_while_another_contradicts_the_angle_or_it_turns_round) {
     struct {
         uint32_t contradicts, phases;
@@ -143,6 +144,7 @@ TEST_F(FluxMonitorState, a_check_that_has_failed_in_a_run_remains_failed_until_t
     EXPECT_EQ(step(true), 0u);
 }
 
+// [SR-31]
 TEST_F(FluxMonitorState, a_phase_that_has_been_accepted_as_lost_leaves_no_failed_check) {
     step(true);
     monitor.balance.unbalanced = 2u;
@@ -152,6 +154,7 @@ TEST_F(FluxMonitorState, a_phase_that_has_been_accepted_as_lost_leaves_no_failed
     EXPECT_EQ(step(true), 0u);
 }
 
+// [SR-31]
 TEST_F(FluxMonitorState, what_has_begun_in_a_phase_before_it_was_accepted_as_lost_does_not_end_in_a_fault) {
     step(true);
     const phase_evidence_phase_t begun = {.excess_periods = 20, .turned = 1 << 26, .open_samples = 1};

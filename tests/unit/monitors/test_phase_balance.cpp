@@ -1,4 +1,4 @@
-// Balance of the phases: which differences of one phase from the others are its sensor's.
+// Balance of the phases: which differences of one phase from the others are its sensor's. [SR-28]
 #include <cstdint>
 #include <utility>
 
@@ -68,6 +68,7 @@ TEST_F(PhaseBalance, a_phase_beyond_four_thirds_or_three_quarters_of_all_others_
     }
 }
 
+// [SR-28] [SR-30]
 TEST_F(PhaseBalance, a_phase_within_four_thirds_and_three_quarters_is_none) {
     for (const double within : {1.31, 0.77}) {
         ratio[1] = within;
@@ -82,6 +83,7 @@ TEST_F(PhaseBalance, a_large_error_of_one_phase_accuses_no_other) {
     EXPECT_EQ(balance.unbalanced, 4u);
 }
 
+// [SR-28] [SR-30]
 TEST_F(PhaseBalance, ratios_that_all_phases_have_are_no_sensor_s) {
     for (const double common : {0.77, 1.3, 1.7}) {
         ratio[0] = ratio[1] = ratio[2] = common;
@@ -98,12 +100,14 @@ TEST_F(PhaseBalance, a_small_ratio_of_all_is_the_encoder_s_after_two_windows) {
     EXPECT_EQ(balance.unbalanced, 0u);
 }
 
+// [SR-28] [SR-30]
 TEST_F(PhaseBalance, revolutions_beyond_100_ms_show_nothing) {
     ratio[1] = 1.5;
     EXPECT_EQ(window(4004), 0u);
     EXPECT_EQ(window(3990), FAULT_BIT(FAULT_CURRENT_SENSOR));
 }
 
+// [SR-28] [SR-30]
 TEST_F(PhaseBalance, nothing_is_judged_while_a_phase_does_not_conduct) {
     ratio[1] = 1.5;
     silent = 2;

@@ -1,5 +1,5 @@
 // Plausibility of the phase currents, at the limits of its tolerances, and its verdicts. Machine: saturating, 40 kHz,
-// 240 V.
+// 240 V. [SR-25] [SR-26] [SR-27]
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -45,16 +45,19 @@ class PhaseEvidence : public FluxSamples {
     uint32_t failed = 0;
 };
 
+// [SR-25]
 TEST_F(PhaseEvidence, voltage_without_current_is_phase_open_in_the_third_period_and_not_before_45_us) {
     EXPECT_EQ(periods_to_fault(20, [&](int k) { set(0, 0.0, k * 6e-3); }), 3);
     EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_OPEN));
     EXPECT_EQ(monitor.phases, 1u);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, small_voltage_without_current_is_the_drop_of_the_devices) {
     EXPECT_EQ(periods_to_fault(4000, [&](int k) { set(0, 0.0, k * 6e-3 / 33.0); }), -1);
 }
 
+// [SR-29]
 TEST_F(PhaseEvidence, a_fault_remains_until_the_end_of_the_run) {
     ASSERT_GT(periods_to_fault(20, [&](int k) { set(2, 0.0, k * 6e-3); }), 0);
     set(2, 0.0, 0.0);
@@ -64,6 +67,7 @@ TEST_F(PhaseEvidence, a_fault_remains_until_the_end_of_the_run) {
     EXPECT_EQ(monitor.phases, 4u);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, current_and_flux_linkage_within_the_tolerances_agree) {
     input.electrical = MIDDLE;
     for (const double flux_error : {0.87, 1.0, 1.15}) {
@@ -82,7 +86,7 @@ TEST_F(PhaseEvidence, current_and_flux_linkage_within_the_tolerances_agree) {
 }
 
 // R i is up to 0.8 of the DC-link voltage. The current rises and falls; the integral with the parameter's resistance
-// errs by what the winding's has taken more or less than that, and follows the tables.
+// errs by what the winding's has taken more or less than that, and follows the tables. [SR-30]
 TEST_F(PhaseEvidence, a_winding_from_minus_40_to_155_C_is_no_fault_while_its_current_falls_and_one_far_beyond_is) {
     constexpr double OHM = 10.0, PERIOD_S = 25e-6;
     input.resistance_period_q40 = int32_t(OHM * PERIOD_S * 0x1p40);
@@ -105,6 +109,7 @@ TEST_F(PhaseEvidence, a_winding_from_minus_40_to_155_C_is_no_fault_while_its_cur
     }
 }
 
+// [SR-26]
 TEST_F(PhaseEvidence, constant_current_at_rest_is_the_sensor_s_after_a_quarter_of_a_millisecond) {
     const int periods = periods_to_fault(100, [&](int) { input.current_q9[1] = 5 * 512; });
     EXPECT_EQ(failed, FAULT_BIT(FAULT_CURRENT_SENSOR));
@@ -113,6 +118,7 @@ TEST_F(PhaseEvidence, constant_current_at_rest_is_the_sensor_s_after_a_quarter_o
     EXPECT_EQ(monitor.phases, 2u);
 }
 
+// [SR-26]
 TEST_F(PhaseEvidence, constant_current_with_noise_is_the_sensor_s_after_8_ms_also_outside_a_run) {
     input.run = false;
     const int periods = periods_to_fault(1000, [&](int k) { input.current_q9[1] = 5 * 512 + k % 7; });
@@ -121,6 +127,7 @@ TEST_F(PhaseEvidence, constant_current_with_noise_is_the_sensor_s_after_8_ms_als
     EXPECT_LE(periods, 325);
 }
 
+// [SR-26]
 TEST_F(PhaseEvidence, constant_current_with_noise_that_ends_after_half_a_millisecond_was_the_sensor_s) {
     const auto pulse = [&](int periods) {
         return periods_to_fault(100, [&](int k) { input.current_q9[1] = k < periods ? 5 * 512 + k % 7 : 0; });
@@ -131,6 +138,7 @@ TEST_F(PhaseEvidence, constant_current_with_noise_that_ends_after_half_a_millise
     EXPECT_EQ(monitor.phases, 2u);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, currents_that_the_voltage_ends_between_samples_are_no_corrections_of_the_integral) {
     // A current up to a period of opposite voltage, seen once while the switches are open, never at its end.
     double most_Wb = 0.0;
@@ -152,10 +160,12 @@ TEST_F(PhaseEvidence, currents_that_the_voltage_ends_between_samples_are_no_corr
     EXPECT_LT(std::abs(correction_q29[1]), int32_t(0.1e-3 * Q29));
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, an_offset_within_the_tolerance_is_none) {
     EXPECT_EQ(periods_to_fault(1000, [&](int) { input.current_q9[1] = 512; }), -1);
 }
 
+// [SR-27]
 TEST_F(PhaseEvidence, current_that_moves_at_rest_is_a_shorted_phase) {
     const int periods = periods_to_fault(1000, [&](int k) { input.current_q9[1] = 20 * 512 + 64 * k; });
     EXPECT_EQ(failed, FAULT_BIT(FAULT_PHASE_SHORTED));
@@ -163,6 +173,7 @@ TEST_F(PhaseEvidence, current_that_moves_at_rest_is_a_shorted_phase) {
     EXPECT_LE(periods, 13);
 }
 
+// [SR-26]
 TEST_F(PhaseEvidence, current_of_a_phase_that_is_read_in_another_is_the_sensors) {
     EXPECT_GT(periods_to_fault(40,
                                [&](int k) {
@@ -175,6 +186,7 @@ TEST_F(PhaseEvidence, current_of_a_phase_that_is_read_in_another_is_the_sensors)
 }
 
 // The current of phase 0 ends at once, or does not begin although there is voltage; phase 1, which is off, has one.
+// [SR-26]
 TEST_F(PhaseEvidence, a_current_that_ends_or_does_not_begin_is_the_sensors_when_another_phase_has_one_that_moves) {
     input.electrical = MIDDLE;
     for (const bool ends : {true, false}) {
@@ -196,7 +208,7 @@ TEST_F(PhaseEvidence, a_current_that_ends_or_does_not_begin_is_the_sensors_when_
     }
 }
 
-// Both switches open at the aligned position: parts of what the voltage removes, less its tolerance for delays.
+// Both switches open at the aligned position: parts of what the voltage removes, less its tolerance for delays. [SR-27]
 TEST_F(PhaseEvidence, a_current_that_falls_by_less_than_a_quarter_of_what_the_voltage_removes_is_a_shorted_phase) {
     for (const double part : {0.1, 0.21, 0.26, 0.5}) {
         monitor = {};
@@ -235,6 +247,7 @@ class PhaseEvidenceInTurn : public PhaseEvidence {
     }
 };
 
+// [SR-25] [SR-27]
 TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_at_its_angle_for_20_ms_is_a_fault) {
     for (const int direction : {1, -1}) {
         monitor = {};
@@ -245,6 +258,7 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_at_its_angle_for_20_ms_is_a_f
     }
 }
 
+// [SR-30]
 TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_its_first_stroke_only_is_none) {
     for (const int direction : {1, -1}) {
         monitor = {};
@@ -253,6 +267,7 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_its_first_stroke_only_is_n
     }
 }
 
+// [SR-30]
 TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_each_second_stroke_only_is_none) {
     for (const int direction : {1, -1}) {
         monitor = {};
@@ -260,14 +275,17 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_in_each_second_stroke_only_is
     }
 }
 
+// [SR-30]
 TEST_F(PhaseEvidenceInTurn, two_phases_that_differ_at_their_angles_are_none) {
     EXPECT_EQ(periods_with(2, 3, 1), -1);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_while_another_does_not_conduct_is_none) {
     EXPECT_EQ(periods_with(1, 2, 1), -1);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, after_a_lost_trigger_the_integral_is_that_of_the_tables_and_no_fault) {
     input.electrical = MIDDLE;
     set(0, 10.0, table_Wb(10.0));
@@ -278,6 +296,7 @@ TEST_F(PhaseEvidence, after_a_lost_trigger_the_integral_is_that_of_the_tables_an
     EXPECT_NEAR(correction_q29[0] / Q29, -3.0 * table_Wb(10.0), 1e-6);
 }
 
+// [SR-30]
 TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
     set(0, 10.0, 0.1);
     step();
@@ -288,6 +307,7 @@ TEST_F(PhaseEvidence, an_input_of_the_same_period_changes_nothing) {
 }
 
 // Phase b differs, c conducts at every angle, so that it agrees in each sample; a conducts in its turn or not at all.
+// [SR-30]
 TEST_F(PhaseEvidence, one_phase_that_differs_for_long_is_none_until_each_of_the_others_has_agreed) {
     // 20 ms end between two strokes of b, or in one.
     for (const auto &[a, in_a_revolution] :

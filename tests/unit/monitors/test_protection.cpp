@@ -1,4 +1,4 @@
-// Each check at its limit, and all combinations.
+// Each check at its limit, and all combinations. [SR-39]
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -97,6 +97,7 @@ class Protection : public testing::Test {
     checks_t checks{};
 };
 
+// [SR-05] [SR-15]
 TEST_F(Protection, under_voltage_and_command_are_checked_in_the_deferred_step_and_the_others_in_the_interrupt) {
     input_t input = healthy;
     input.current_max_q9 = 76 << 9;
@@ -113,6 +114,7 @@ TEST_F(Protection, under_voltage_and_command_are_checked_in_the_deferred_step_an
     EXPECT_EQ(checks.check_deferred(input), FAULT_BIT(FAULT_UNDER_VOLTAGE) | FAULT_BIT(FAULT_COMMAND_TIMEOUT));
 }
 
+// [SR-46]
 TEST_F(Protection, eight_periods_without_a_deferred_step_are_an_overrun) {
     input_t input = healthy;
     input.skipped_deferred = PROTECTION_SKIPPED_DEFERRED_MAX - 1;
@@ -125,6 +127,7 @@ TEST_F(Protection, eight_periods_without_a_deferred_step_are_an_overrun) {
     EXPECT_EQ(check(input), 0);
 }
 
+// [SR-20]
 TEST_F(Protection, a_frozen_encoder_is_detected_after_the_same_travel_when_periods_are_skipped) {
     for (const int32_t speed_rad_s : {10, 60, 300}) {
         int detected[3] = {};
@@ -146,6 +149,7 @@ TEST_F(Protection, a_frozen_encoder_is_detected_after_the_same_travel_when_perio
     }
 }
 
+// [SR-20] [SR-46]
 TEST_F(Protection, any_number_of_skipped_periods_overflows_nothing) {
     input_t input = healthy;
     turn(input, INT32_MAX);
@@ -159,12 +163,14 @@ TEST_F(Protection, any_number_of_skipped_periods_overflows_nothing) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER));
 }
 
+// [SR-30]
 TEST_F(Protection, no_check_fails_in_a_healthy_drive) {
     for (int k = 0; k < 1000; k++) {
         ASSERT_EQ(check(healthy), 0);
     }
 }
 
+// [SR-11]
 TEST_F(Protection, a_current_above_the_trip_is_an_over_current) {
     input_t input = healthy;
     input.current_max_q9 = 75 << 9;
@@ -173,6 +179,7 @@ TEST_F(Protection, a_current_above_the_trip_is_an_over_current) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_OVER_CURRENT));
 }
 
+// [SR-13] [SR-15]
 TEST_F(Protection, a_voltage_beyond_its_limit_is_an_over_or_under_voltage) {
     input_t input = healthy;
     input.dc_link_voltage_q6 = 300 << 6;
@@ -185,6 +192,7 @@ TEST_F(Protection, a_voltage_beyond_its_limit_is_an_over_or_under_voltage) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_UNDER_VOLTAGE));
 }
 
+// [SR-19]
 TEST_F(Protection, an_encoder_step_above_the_limit_per_period_is_a_fault) {
     input_t input = healthy;
     for (const uint32_t step : {ANGLE_STEP_MAX, -ANGLE_STEP_MAX}) {
@@ -198,6 +206,7 @@ TEST_F(Protection, an_encoder_step_above_the_limit_per_period_is_a_fault) {
     }
 }
 
+// [SR-19]
 TEST_F(Protection, a_wrap_of_the_angle_is_no_jump) {
     input_t input = healthy;
     input.encoder_angle = 10;
@@ -207,6 +216,7 @@ TEST_F(Protection, a_wrap_of_the_angle_is_no_jump) {
     EXPECT_EQ(check(input), 0);
 }
 
+// [SR-19]
 TEST_F(Protection, the_limit_of_an_encoder_step_scales_with_the_lost_periods) {
     input_t input = healthy;
     input.missed_interrupts = 2;
@@ -219,6 +229,7 @@ TEST_F(Protection, the_limit_of_an_encoder_step_scales_with_the_lost_periods) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER));
 }
 
+// [SR-20]
 TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it_to_standstill) {
     // At constant deceleration from v the rotor travels v^2 / 2a: 4.1 rad/s is within the limit, 4.5 rad/s beyond it.
     for (const int32_t sign : {1, -1}) {
@@ -239,6 +250,7 @@ TEST_F(Protection, a_frozen_encoder_is_detected_although_the_observer_follows_it
     }
 }
 
+// [SR-20]
 TEST_F(Protection, what_the_observer_makes_of_one_count_after_rest_is_no_speed_and_of_a_second_one_is) {
     input_t input = healthy;
     input.encoder_angle++;
@@ -256,6 +268,7 @@ TEST_F(Protection, what_the_observer_makes_of_one_count_after_rest_is_no_speed_a
     EXPECT_LT(periods, 1000);
 }
 
+// [SR-20]
 TEST_F(Protection, an_encoder_is_frozen_when_the_travel_of_the_slowest_possible_rotor_exceeds_the_limit) {
     for (const int32_t sign : {1, -1}) {
         checks.reset(healthy.encoder_angle);
@@ -279,6 +292,7 @@ TEST_F(Protection, an_encoder_is_frozen_when_the_travel_of_the_slowest_possible_
     }
 }
 
+// [SR-20]
 TEST_F(Protection, a_rotor_that_is_only_predicted_to_leave_standstill_is_no_evidence) {
     input_t input = healthy;
     input.speed_q22 = 100 << 22; // a locked rotor under torque, by the observer
@@ -287,6 +301,7 @@ TEST_F(Protection, a_rotor_that_is_only_predicted_to_leave_standstill_is_no_evid
     }
 }
 
+// [SR-20]
 TEST_F(Protection, a_constant_encoder_angle_is_no_fault_at_standstill) {
     input_t input = healthy;
     input.speed_q22 = (1 << 22) - 1;
@@ -296,6 +311,7 @@ TEST_F(Protection, a_constant_encoder_angle_is_no_fault_at_standstill) {
     EXPECT_EQ(checks.deferred.undetected_travel, 0);
 }
 
+// [SR-19] [SR-20]
 TEST_F(Protection, mirrored_random_motion_gives_the_same_fault_masks) {
     std::mt19937 random(11);
     checks_t mirrored{};
@@ -321,6 +337,7 @@ TEST_F(Protection, mirrored_random_motion_gives_the_same_fault_masks) {
     EXPECT_LT(encoder, 50000u);
 }
 
+// [SR-20]
 TEST_F(Protection, a_reversal_within_one_count_is_no_frozen_encoder) {
     input_t input = healthy;
     // From 50 rad/s to -50 rad/s in 2000 periods, the count is constant while the speed is below 2 rad/s.
@@ -333,6 +350,7 @@ TEST_F(Protection, a_reversal_within_one_count_is_no_frozen_encoder) {
     }
 }
 
+// [SR-20]
 TEST_F(Protection, the_undetected_travel_of_a_permanently_frozen_encoder_does_not_overflow) {
     input_t input = healthy;
     turn(input, INT32_MAX);
@@ -343,6 +361,7 @@ TEST_F(Protection, the_undetected_travel_of_a_permanently_frozen_encoder_does_no
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER));
 }
 
+// [SR-05]
 TEST_F(Protection, a_command_older_than_the_timeout_is_a_fault) {
     input_t input = healthy;
     input.command_age_us = 100000;
@@ -351,6 +370,7 @@ TEST_F(Protection, a_command_older_than_the_timeout_is_a_fault) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_COMMAND_TIMEOUT));
 }
 
+// [SR-46]
 TEST_F(Protection, three_consecutive_lost_interrupts_are_an_overrun_and_a_period_in_time_resets_the_count) {
     input_t input = healthy, missed = healthy;
     missed.missed_interrupts = 1;
@@ -366,6 +386,7 @@ TEST_F(Protection, three_consecutive_lost_interrupts_are_an_overrun_and_a_period
     EXPECT_EQ(check(missed), FAULT_BIT(FAULT_INTERRUPT_OVERRUN));
 }
 
+// [SR-19]
 TEST_F(Protection, a_jump_of_the_encoder_over_lost_interrupts_that_are_a_fault_is_no_fault_of_the_encoder) {
     for (const uint32_t missed : {3u, 15u, 400u, UINT32_MAX}) {
         checks.reset(healthy.encoder_angle);
@@ -376,6 +397,7 @@ TEST_F(Protection, a_jump_of_the_encoder_over_lost_interrupts_that_are_a_fault_i
     }
 }
 
+// [SR-02] [SR-11] [SR-12] [SR-13] [SR-19] [SR-46]
 TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
     for (unsigned mask = 0; mask < 32; mask++) {
         checks.reset(healthy.encoder_angle);
@@ -408,6 +430,7 @@ TEST_F(Protection, every_combination_of_failed_checks_is_reported) {
     }
 }
 
+// [SR-20]
 TEST(ProtectionStandstill, an_encoder_that_does_not_count_is_a_fault_from_1_rad_s_on_and_none_below) {
     protection_parameters_t parameters = PARAMETERS;
     parameters.deceleration_max_q22 = 0;

@@ -1,3 +1,4 @@
+// [SR-24]
 #include <cmath>
 
 #include <gtest/gtest.h>
@@ -196,6 +197,19 @@ TEST_F(Stall, without_the_torque_at_its_limit_or_a_large_error_or_a_reference_th
     input.speed_q22 = -30 * RAD_S;
     input.speed_reference_q22 = 0;
     EXPECT_EQ(time_to_fault_us(), 0u);
+}
+
+// At a speed of 0 it does not turn backwards, in either direction of the reference.
+TEST_F(Stall, a_rotor_that_stands_with_less_torque_than_the_limit_or_where_there_is_none_is_not_stalled) {
+    for (const int direction : {1, -1}) {
+        for (const int torque_Nm : {0, 17}) {
+            input.speed_reference_q22 = direction * 60 * RAD_S;
+            input.torque_reference_q24 = direction * torque_Nm * NM;
+            input.torque_max_q24 = torque_Nm == 0 ? 0 : 19 * NM;
+            input.torque_min_q24 = -input.torque_max_q24;
+            EXPECT_EQ(time_to_fault_us(), 0u) << direction * torque_Nm;
+        }
+    }
 }
 
 TEST_F(Stall, outside_speed_mode_there_is_none) {

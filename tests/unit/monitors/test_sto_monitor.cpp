@@ -1,3 +1,4 @@
+// [SR-03]
 #include <gtest/gtest.h>
 
 extern "C" {

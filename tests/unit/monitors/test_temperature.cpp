@@ -1,4 +1,4 @@
-// Measured temperatures: sensors that are open or shorted, the limit of the torque, the faults.
+// Measured temperatures: sensors that are open or shorted, the limit of the torque, the faults. [SR-17]
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -100,6 +100,7 @@ TEST_F(Temperature, fault_begins_at_the_limit_and_ends_20_K_below_it) {
     }
 }
 
+// [SR-18]
 TEST_F(Temperature, third_invalid_reading_in_succession_is_a_failed_sensor_and_a_valid_one_ends_it) {
     step(2);
     for (const uint16_t code : {uint16_t(0), uint16_t(4095), uint16_t(61441), uint16_t(65520)}) {
@@ -118,6 +119,7 @@ TEST_F(Temperature, third_invalid_reading_in_succession_is_a_failed_sensor_and_a
     }
 }
 
+// [SR-18]
 TEST_F(Temperature, codes_at_the_limits_are_valid) {
     for (const uint16_t code : {uint16_t(4096), uint16_t(61440)}) {
         hal.code[HAL_ADC_WINDING] = code;
@@ -126,6 +128,7 @@ TEST_F(Temperature, codes_at_the_limits_are_valid) {
     }
 }
 
+// [SR-18]
 TEST_F(Temperature, a_hot_winding_stays_hot_while_its_sensor_cannot_be_read) {
     hal.code[HAL_ADC_WINDING] = code_of(140.0);
     step();
@@ -135,6 +138,7 @@ TEST_F(Temperature, a_hot_winding_stays_hot_while_its_sensor_cannot_be_read) {
     EXPECT_NEAR(limit_Nm(), TORQUE_MAX_NM / 2.0, 0.02);
 }
 
+// [SR-18]
 TEST_F(Temperature, sensor_that_is_open_at_the_first_reading_has_failed_then_and_those_of_no_phase_do_not_count) {
     hal.code[HAL_ADC_WINDING + 3] = hal.code[HAL_ADC_INVERTER + 3] = 65520;
     step();
@@ -145,6 +149,7 @@ TEST_F(Temperature, sensor_that_is_open_at_the_first_reading_has_failed_then_and
     EXPECT_EQ(faults(), FAULT_BIT(FAULT_TEMPERATURE_SENSOR));
 }
 
+// [SR-18]
 TEST_F(Temperature, the_first_step_is_due_at_the_start_whenever_it_comes_then) {
     hal.code[HAL_ADC_WINDING] = code_of(160.0);
     for (const uint32_t start_us : {0u, 5000u, UINT32_MAX - 12000}) {
@@ -159,6 +164,7 @@ TEST_F(Temperature, the_first_step_is_due_at_the_start_whenever_it_comes_then) {
     }
 }
 
+// [SR-18]
 TEST_F(Temperature, each_sensor_of_either_part_has_a_bit_of_its_own_and_a_part_its_own_fault) {
     for (unsigned phase = 0; phase < PHASES; phase++) {
         for (const auto &[first, part, fault] :

@@ -1,4 +1,4 @@
-// Thermal models of windings and switches against first-order models in double precision.
+// Thermal models of windings and switches against first-order models in double precision. [SR-16]
 #include <cmath>
 #include <random>
 #include <tuple>

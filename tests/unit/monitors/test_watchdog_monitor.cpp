@@ -1,4 +1,4 @@
-// When the watchdog may be kicked.
+// When the watchdog may be kicked. [SR-47]
 #include <gtest/gtest.h>
 
 extern "C" {

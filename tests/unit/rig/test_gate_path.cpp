@@ -1,4 +1,4 @@
-// Causes that open the switches without the firmware (rig/board.h).
+// Causes that open the switches without the firmware (rig/board.h). [SR-45]
 #include <gtest/gtest.h>
 
 #include "support/emulator_machines.h"
@@ -101,6 +101,7 @@ TEST_F(GatePath, values_that_are_cleared_count_as_renewed) {
     }
 }
 
+// [SR-01]
 TEST_F(GatePath, either_line_of_safe_torque_off_opens_at_once_until_it_is_energised_and_cleared) {
     for (unsigned line = 0; line < BOARD_STO_LINES; line++) {
         const uint32_t cause = line == 0 ? HAL_PWM_BREAK_STO_1 : HAL_PWM_BREAK_STO_2;

@@ -1,4 +1,4 @@
-// Records in two pages: what a start finds, and what one that is given up leaves.
+// Records in two pages: what a start finds, and what one that is given up leaves. [SR-59]
 #include <array>
 #include <cstring>
 
@@ -72,6 +72,7 @@ TEST_F(NvmRing, a_header_is_magic_layout_version_length_and_sequence_number) {
     }
 }
 
+// [SR-58]
 TEST_F(NvmRing, an_erased_memory_has_no_record_and_no_damage) {
     EXPECT_EQ(ring.sequence, 0u);
     EXPECT_FALSE(ring.damaged);
@@ -91,6 +92,7 @@ TEST_F(NvmRing, a_record_takes_one_step_for_each_word_and_is_found_again) {
     }
 }
 
+// [SR-58]
 TEST_F(NvmRing, every_bit_of_a_committed_record_that_flips_makes_it_damaged_until_one_is_written) {
     write(1);
     for (unsigned index = 0; index + 1 < RECORD_WORDS; index++) {

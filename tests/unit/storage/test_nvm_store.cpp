@@ -1,4 +1,4 @@
-// The memory of the drive: what survives a reset, power cuts at every operation, sets that must not be loaded.
+// The memory of the drive: what survives a reset, power cuts at every operation, sets that must not be loaded. [SR-59]
 #include <cstdio>
 #include <cstring>
 #include <vector>
@@ -46,6 +46,7 @@ TEST(PowerCuts, at_every_operation_of_parameter_writes_lose_and_mix_nothing) {
     EXPECT_GT(result.pairs, 4u * 9 * SET_WORDS * SET_WORDS);
 }
 
+// [SR-59] [SR-60]
 TEST(PowerCuts, at_every_operation_of_log_entries_lose_and_mix_nothing) {
     power_cuts_t result{};
     cut_writes(&result, &work, WRITE_FAULT, 2 * FAULTS_PER_PAGE + 2, paired_fault);
@@ -139,6 +140,7 @@ class NvmStore : public testing::Test {
     started_t drive;
 };
 
+// [SR-58]
 TEST_F(NvmStore, an_erased_memory_gives_the_defaults_without_inhibiting_the_start) {
     EXPECT_TRUE(has_set(&drive, 0));
     EXPECT_FALSE(drive.store.inhibited);
@@ -146,6 +148,7 @@ TEST_F(NvmStore, an_erased_memory_gives_the_defaults_without_inhibiting_the_star
     EXPECT_EQ(nvm_store_newest_fault(&drive.store), 0u);
 }
 
+// [SR-58]
 TEST_F(NvmStore, every_bit_of_the_newest_set_that_flips_makes_the_drive_use_the_set_before) {
     write(WRITE_SET);
     write(WRITE_SET);
@@ -162,6 +165,7 @@ TEST_F(NvmStore, every_bit_of_the_newest_set_that_flips_makes_the_drive_use_the_
     }
 }
 
+// [SR-58]
 TEST_F(NvmStore, sets_that_are_all_damaged_give_the_defaults_and_inhibit_the_start_until_one_is_stored) {
     write(WRITE_SET);
     write(WRITE_SET);
@@ -185,6 +189,7 @@ TEST_F(NvmStore, sets_that_are_all_damaged_give_the_defaults_and_inhibit_the_sta
     EXPECT_FALSE(drive.store.inhibited);
 }
 
+// [SR-58]
 TEST_F(NvmStore, a_set_of_another_machine_is_not_loaded_and_inhibits_the_start) {
     write(WRITE_SET);
     memory.sets = 1;
@@ -198,6 +203,7 @@ TEST_F(NvmStore, a_set_of_another_machine_is_not_loaded_and_inhibits_the_start) 
     EXPECT_FALSE(drive.store.inhibited);
 }
 
+// [SR-58]
 TEST_F(NvmStore, the_newest_of_a_thousand_sets_is_loaded_and_the_pages_wear_equally) {
     for (unsigned i = 0; i < 1000; i++) {
         write(WRITE_SET);
@@ -208,6 +214,7 @@ TEST_F(NvmStore, the_newest_of_a_thousand_sets_is_loaded_and_the_pages_wear_equa
     EXPECT_NEAR(erasures[PARAMETER_PAGE + 1], 1000.0 / SETS_PER_PAGE / 2, 1.0);
 }
 
+// [SR-60]
 TEST_F(NvmStore, the_last_16_faults_are_read_and_no_other) {
     for (unsigned i = 0; i < 3 * FAULTS_PER_PAGE; i++) {
         write(WRITE_FAULT);
@@ -314,6 +321,7 @@ TEST_F(NvmStore, a_word_that_the_memory_only_says_to_have_programmed_is_read_bac
     }
 }
 
+// [SR-58]
 TEST_F(NvmStore, a_set_whose_commit_word_is_torn_is_loaded_and_stored_once_more_at_the_start) {
     write(WRITE_SET);
     *set_word(0, SET_WORDS - 1) ^= 1;
@@ -358,7 +366,7 @@ TEST_F(NvmStore, saves_that_a_page_of_bad_words_does_not_take_fail_and_cost_no_s
     EXPECT_EQ(memory.hal.nvm.erasures[PARAMETER_PAGE], 0u);
 }
 
-// Damaged sets are kept like a valid one: without them the drive would start with its defaults.
+// Damaged sets are kept like a valid one: without them the drive would start with its defaults. [SR-58]
 TEST_F(NvmStore, saves_that_a_page_of_bad_words_does_not_take_leave_the_start_inhibited_by_damaged_sets) {
     for (unsigned i = 0; i < SETS_PER_PAGE; i++) {
         write(WRITE_SET);
@@ -404,6 +412,7 @@ TEST_F(NvmStore, sets_that_change_while_they_are_written_cost_no_set_of_the_othe
     EXPECT_EQ(drive.parameters.values[0], before + step);
 }
 
+// [SR-60]
 TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_again) {
     fault_record_t record = fault_of(1);
     for (unsigned i = 0; i < 10; i++) {
@@ -418,6 +427,7 @@ TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_agai
     EXPECT_EQ(drive.store.waiting_count, 2);
 }
 
+// [SR-60]
 TEST_F(NvmStore, two_faults_that_wait_are_both_logged_in_their_order) {
     for (const uint32_t number : {1u, 2u}) {
         const fault_record_t record = fault_of(number);
@@ -434,6 +444,7 @@ TEST_F(NvmStore, two_faults_that_wait_are_both_logged_in_their_order) {
     }
 }
 
+// [SR-60]
 TEST_F(NvmStore, the_time_of_a_fault_counts_the_wraps_of_the_clock) {
     nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 100, false);
     nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 10, false);
@@ -445,6 +456,38 @@ TEST_F(NvmStore, the_time_of_a_fault_counts_the_wraps_of_the_clock) {
     nvm_store_follow_fault(&drive.store, &record);
     EXPECT_EQ(drive.store.waiting[0].time_wraps, 1);
     EXPECT_EQ(drive.store.waiting[1].time_wraps, 2);
+}
+
+// [SR-60]
+TEST_F(NvmStore, a_fault_of_before_the_last_step_has_not_wrapped_and_the_wraps_end_at_their_largest_number) {
+    nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 5000, false);
+    fault_record_t record = fault_of(1);
+    record.time_us = 4000;
+    nvm_store_follow_fault(&drive.store, &record);
+    EXPECT_EQ(drive.store.waiting[0].time_us, 4000u);
+    EXPECT_EQ(drive.store.waiting[0].time_wraps, 0);
+    drive.store.time_wraps = UINT16_MAX - 1; // some 9 years
+    for (int wrap = 0; wrap < 3; wrap++) {
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, UINT32_MAX - 10, false);
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 10, false);
+        EXPECT_EQ(drive.store.time_wraps, UINT16_MAX);
+    }
+}
+
+// [SR-60]
+TEST_F(NvmStore, a_logged_fault_that_has_changed_in_the_memory_is_not_read_and_the_others_are) {
+    for (int k = 0; k < 3; k++) {
+        write(WRITE_FAULT);
+    }
+    uint64_t *words = memory.hal.nvm.word[FAULT_PAGE];
+    const uint64_t before = words[FAULT_WORDS + 1]; // of the second record
+    words[FAULT_WORDS + 1] ^= UINT64_C(1) << 17;
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 1));
+    nvm_store_fault_t read{};
+    EXPECT_FALSE(nvm_store_read_fault(&drive.store, &memory.hal, 2, &read));
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 3));
+    words[FAULT_WORDS + 1] = before;
+    EXPECT_TRUE(has_fault(&drive, &memory.hal, 2));
 }
 
 } // namespace

@@ -1,4 +1,5 @@
 // Parameters in memory: what a start sets, what each change keeps intact, and the supply against its thresholds.
+// [SR-56]
 #include <cstring>
 #include <utility>
 
@@ -21,6 +22,7 @@ class StoredParameters : public testing::Test {
     parameters_t parameters;
 };
 
+// [SR-57]
 TEST_F(StoredParameters, a_start_sets_every_value_to_the_machine_s_default_whatever_was_in_memory) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         EXPECT_EQ(parameters.values[i], machine_tables.parameter_default[i]) << i;
@@ -29,6 +31,7 @@ TEST_F(StoredParameters, a_start_sets_every_value_to_the_machine_s_default_whate
     EXPECT_TRUE(parameters_intact(&parameters));
 }
 
+// [SR-57]
 TEST_F(StoredParameters, each_change_is_one_revision_and_leaves_them_intact) {
     uint32_t revision = parameters.revision;
     const auto changed = [&](uint32_t by) {
@@ -50,6 +53,7 @@ TEST_F(StoredParameters, each_change_is_one_revision_and_leaves_them_intact) {
     EXPECT_TRUE(changed(0));
 }
 
+// [SR-57]
 TEST_F(StoredParameters, every_bit_that_flips_in_a_value_the_controller_the_rate_or_the_sum_is_noticed) {
     for (unsigned i = 0; i < PARAMETER_COUNT + 3; i++) {
         for (unsigned bit = 0; bit < 32; bit++) {
@@ -76,6 +80,7 @@ TEST_F(StoredParameters, every_bit_that_flips_in_a_value_the_controller_the_rate
     EXPECT_FALSE(parameters_intact(&cleared));
 }
 
+// [SR-57]
 TEST_F(StoredParameters, a_value_beyond_its_limits_is_set_to_the_limit) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         const parameter_row_t *row = parameters_row(i);

@@ -47,6 +47,16 @@ inline hal_can_frame_t torque_command(uint8_t counter, unsigned request, int32_t
                            counter, message, drive_torque_command_pack);
 }
 
+// DRIVE_POSITION_COMMAND with its checksum; the values are not checked.
+inline hal_can_frame_t position_command(uint8_t counter, unsigned request, unsigned order, int32_t turns_q18) {
+    drive_position_command_t message{};
+    message.request = uint8_t(request);
+    message.order = uint8_t(order);
+    message.position_deg = turns_q18;
+    return protected_frame(DRIVE_POSITION_COMMAND_FRAME_ID, DRIVE_POSITION_COMMAND_LENGTH,
+                           DRIVE_POSITION_COMMAND_E2E_DATA_ID, counter, message, drive_position_command_pack);
+}
+
 // DRIVE_IDENTIFY_COMMAND with its checksum; the values are not checked.
 inline hal_can_frame_t identify_command(uint8_t counter, unsigned request, unsigned kind, unsigned phase,
                                         uint8_t number = 1) {

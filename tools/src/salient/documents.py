@@ -17,11 +17,22 @@ def write_reference() -> None:
     from salient.bench import faults
     from salient.board import pins
     from salient.experiments.campaign import report
-    from salient.generate import checkers, commands, objects, parameters, resolution, signals
+    from salient.generate import (
+        checkers,
+        commands,
+        diagnostic_coverage,
+        objects,
+        parameters,
+        requirements,
+        resolution,
+        signals,
+    )
 
     for page in (faults, checkers, commands, objects, parameters, resolution, signals):
         page.main()
     report.write_pages()
+    requirements.write()
+    diagnostic_coverage.write()
     pins.write_documents()
 
 

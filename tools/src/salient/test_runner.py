@@ -106,7 +106,7 @@ def _one(passed: bool) -> Count:
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 def _style() -> Count:
-    """ruff, mypy, clang-format, clang-tidy, limits of C functions, British spelling and language."""
+    """ruff, mypy, clang-format, clang-tidy, limits of C functions, language, requirements, British spelling."""
     count = _one(_succeeds(_tool("ruff"), "check", "--no-cache", "--config", CONFIGURATION, "tools", "tests"))
     count += _one(_succeeds(_tool("mypy"), "--config-file", CONFIGURATION, "--cache-dir", BUILD / "mypy",
                             "--no-error-summary"))
@@ -115,6 +115,7 @@ def _style() -> Count:
     count += _one(_clang_tidy())
     count += _one(_within_limits())
     count += _one(_keeps_the_language())
+    count += _one(_traces_its_requirements())
     documents = sorted(ROOT.glob("*.md"))
     count += _one(_succeeds(_tool("codespell"), "--toml", CONFIGURATION, *documents,
                             *(name for name in CHECKED_FOR_SPELLING if (ROOT / name).exists())))
@@ -218,6 +219,16 @@ def _keeps_the_language() -> bool:
     from salient import language
 
     return _all_explained(language.EXCEPTIONS, language.violations)
+
+
+def _traces_its_requirements() -> bool:
+    """Marks of requirements in functions and tests."""
+    from salient import traceability
+
+    lines = traceability.violations()
+    for line in lines:
+        _print(line)
+    return not lines
 
 
 def _all_explained(exceptions: Path, violations: Callable[[Mapping[str, str]], list[str]]) -> bool:

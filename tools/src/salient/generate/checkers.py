@@ -41,10 +41,11 @@ def table() -> list[tuple[str, str]]:
 
 
 def property_of(name: str) -> str:
-    """Property that a checker's file states."""
+    """Property that a checker's file states, without its marks (salient.traceability)."""
     text = (CAMPAIGN / "checkers" / f"{name}.c").read_text(encoding="utf-8")
     found = re.match(r"/\*(.*?)\*/", text, re.DOTALL)
-    return " ".join(found[1].replace("\n *", " ").split()) if found else ""
+    text = re.sub(r" \[SR-\d\d\]", "", found[1].replace("\n *", " ")) if found else ""
+    return " ".join(text.split())
 
 
 def page() -> str:
