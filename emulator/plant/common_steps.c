@@ -222,12 +222,14 @@ MAGNETICS_INLINE double step_length_s(plant_t *plant, const integrator_setting_t
     if (speed_rad_s * limit_s > plant->limits.angle_rad) {
         limit_s = plant->limits.angle_rad / speed_rad_s;
     }
-    limit_s = min_double(limit_s, plant->limits.factor * coupled_loop_step_s(plant, setting));
     for (unsigned index = 0; index < setting->count; index++) {
         const double slope_A_s = fabs(first->current_A_s[index]);
         if (slope_A_s * limit_s > plant->limits.current_A) {
             limit_s = plant->limits.current_A / slope_A_s;
         }
+    }
+    if (setting->coupled != NULL) {
+        limit_s = min_double(limit_s, coupled_loop_step_s(plant, setting));
     }
     double step_s = remaining_s;
     if (remaining_s > limit_s) {
@@ -235,6 +237,9 @@ MAGNETICS_INLINE double step_length_s(plant_t *plant, const integrator_setting_t
     }
     if (setting->count == 0) {
         return step_s;
+    }
+    if (setting->coupled != NULL) {
+        step_s = min_double(step_s, coupled_reversal_s(plant, setting, first));
     }
 
     const double angle_rad = plant->rotor_angle_rad, acceleration_rad_s2 = first->acceleration_rad_s2;

@@ -6,6 +6,10 @@
 #include "plant/integrator_shaft.h"
 #include "plant/units.h"
 
+/* A step ends where a magnetomotive force changes its sign, but within this time: the second derivative of the
+ * magnetics jumps there. */
+#define REVERSAL_LEAST_S 1e-9
+
 _Static_assert(MACHINE_PHASES_MAX == HAL_PHASES_MAX, "phases");
 
 /* Longest step of an open winding's eddy currents, in their time constant at the least inductance: they are small, and
@@ -54,13 +58,39 @@ void coupled_evaluate(const magnetics_model_t *model, const coupled_t *coupled, 
 }
 
 double coupled_loop_step_s(const plant_t *plant, const integrator_setting_t *setting) {
-    double step_s = INFINITY;
     for (unsigned index = 0; plant->coupled.eddy_S > 0.0 && index < setting->count; index++) {
         if (setting->isolated[index]) {
-            step_s = LOOP_TIME_CONSTANTS * plant->coupled.eddy_S * plant->magnetics.unaligned_inductance_H;
+            return plant->limits.factor * LOOP_TIME_CONSTANTS * plant->coupled.eddy_S *
+                   plant->magnetics.unaligned_inductance_H;
         }
     }
-    return step_s;
+    return INFINITY;
+}
+
+double coupled_reversal_s(const plant_t *plant, const integrator_setting_t *setting,
+                          const integrator_derivative_t *first) {
+    const coupled_t *coupled = &plant->coupled;
+    double nearest_s = INFINITY;
+    for (unsigned pole = 0; coupled->mutual && pole < coupled->phases; pole++) {
+        double mmf_A = 0.0, rate_A_s = 0.0, bend_A_s2 = 0.0;
+        for (unsigned index = 0; index < setting->count; index++) {
+            const double share = coupled->share[pole][setting->phase[index]];
+            mmf_A += share * plant->current_A[setting->phase[index]];
+            rate_A_s += share * first->current_A_s[index];
+            bend_A_s2 += share * first->current_A_s2[index];
+        }
+        if (mmf_A * rate_A_s < 0.0) {
+            double at_s = -mmf_A / rate_A_s;
+            const double end_A_s = rate_A_s + bend_A_s2 * at_s;
+            if (end_A_s * rate_A_s > 0.0) {
+                at_s -= 0.5 * bend_A_s2 * at_s * at_s / end_A_s;
+            }
+            if (at_s > REVERSAL_LEAST_S) {
+                nearest_s = fmin(nearest_s, at_s);
+            }
+        }
+    }
+    return nearest_s;
 }
 
 /* Solves matrix x = x, which is symmetric and positive definite, by Gauss's elimination. */

@@ -43,8 +43,13 @@ double coupled_mmf_A(const coupled_t *coupled, const double current_A[HAL_PHASES
 void coupled_evaluate(const magnetics_model_t *model, const coupled_t *coupled, double rotor_angle_rad, unsigned phase,
                       double mmf_A, double ahead_rad, magnetics_point_t *point);
 
-/* Longest step with eddy currents of windings that are open, at step factor 1; infinite without. */
+/* Longest step with eddy currents of open windings; infinite without. */
 double coupled_loop_step_s(const plant_t *plant, const integrator_setting_t *setting);
+
+/* Time from the present state, where the derivatives are `first`, to the next reversal of a magnetomotive force, to
+ * second order; infinite without. */
+double coupled_reversal_s(const plant_t *plant, const integrator_setting_t *setting,
+                          const integrator_derivative_t *first);
 
 /* integrator_differentiate for a setting with `coupled`. */
 void coupled_differentiate(const integrator_setting_t *setting, const integrator_state_t *state,

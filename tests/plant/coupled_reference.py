@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 TOLERANCE = 1e-11
 RATE_STEP_S = 1e-8
 CONDUCTION_V = 1e-5
+TRIAL_S = 1e-11
 
 Array = np.ndarray
 
@@ -121,6 +122,10 @@ def find_segment(model: Coupled, y: Array, volts: Sequence[float], guess: Array)
     if model.eddy_S > 0.0:
         isolated = [phase for phase in range(n)
                     if volts[phase] <= 0.0 and terminal_A(model, phase, volts[phase], currents) <= 1e-9]
+        # At the event itself: by what the current does next.
+        trial = y + TRIAL_S * rates(model, 0.0, Segment(list(range(n)), isolated), volts, y, guess)
+        after = model.currents(trial[n + 1], trial[:n], list(range(n)), guess)
+        isolated = [phase for phase in isolated if terminal_A(model, phase, volts[phase], after) <= 0.0]
         asleep = [phase for phase in isolated if not model.mutual and currents[phase] < 1e-9]
         return Segment([phase for phase in range(n) if phase not in asleep],
                        [phase for phase in isolated if phase not in asleep])

@@ -68,7 +68,8 @@ def switched(periods: int) -> Run:
 @pytest.mark.in_turns
 @pytest.mark.parametrize(("form", "kind", "periods"), [
     ("linear_cosine", "coupled", 150), ("saturating", "coupled", 150), ("linear_trapezoid", "spread", 150),
-    ("saturating", "spread", 150), ("saturating", "eddy", 45), ("linear_cosine", "all", 15)])
+    ("saturating", "spread", 150), ("saturating", "eddy", 60), ("linear_cosine", "all", 30),
+    ("saturating", "all", 15)])
 def test_states_are_those_of_an_independent_integration(library: ctypes.CDLL, form: str, kind: str, periods: int
                                                         ) -> None:
     machine = with_circuit(formula_machine(form), kind)
