@@ -99,7 +99,7 @@ typedef struct plant {
     uint64_t time_ns;
     double speed_rad_s;
     double rotor_angle_rad;           /* unwrapped */
-    double current_A[HAL_PHASES_MAX]; /* with shorted turns: plant_current_A */
+    double current_A[HAL_PHASES_MAX]; /* with shorted turns or eddy currents: plant_current_A */
     double bus_voltage_V;
     uint8_t switches[HAL_PHASES_MAX]; /* that are on: HALF_BRIDGE_UPPER, HALF_BRIDGE_LOWER */
     bool chopper_on;
