@@ -108,7 +108,7 @@ def run_coupled(machine: Machine, run: Run) -> dict[str, Array]:
         at_s = 0.0
         while at_s < period_s:
             segment = find_segment(model, y, volts, guess)
-            y, at_s = advance(model, run.load_torque_Nm, segment, volts, y, at_s, period_s, guess)
+            y, at_s = advance(model, run.load_torque_Nm, segment, volts, y, (at_s, period_s), guess)
     observe(volts)
     columns = np.array(rows).T
     return {"angle": columns[0], "speed": columns[1], "torque": columns[2], "currents": columns[3:3 + n],
@@ -167,8 +167,8 @@ def induced(model: Coupled, y: Array, segment: Segment, volts: Sequence[float], 
     return float((ends[1] - ends[0]) / (2.0 * RATE_STEP_S))
 
 
-def advance(model: Coupled, load: float, segment: Segment, volts: Sequence[float], y: Array, at_s: float, until_s: float,
-            guess: Array) -> tuple[Array, float]:
+def advance(model: Coupled, load: float, segment: Segment, volts: Sequence[float], y: Array,
+            span_s: tuple[float, float], guess: Array) -> tuple[Array, float]:
     """To the next event or the end; the flux linkages of open windings follow from the currents."""
     n = model.phases
     stops: list[Callable[[float, Array], float]] = []
@@ -197,7 +197,7 @@ def advance(model: Coupled, load: float, segment: Segment, volts: Sequence[float
         pitch = 2 * model.pole.half_pitch
         ahead = min((corner - y[n + 1]) % pitch for corner in model.corners if (corner - y[n + 1]) % pitch > 1e-9)
         add(lambda state, at=y[n + 1] + ahead: state[n + 1] - at, 1.0)
-    done = solve_ivp(lambda _, state: rates(model, load, segment, volts, state, guess), (at_s, until_s), y,
+    done = solve_ivp(lambda _, state: rates(model, load, segment, volts, state, guess), span_s, y,
                      method="Radau" if segment.isolated else "DOP853", rtol=TOLERANCE, atol=1e-13,
                      events=stops or None)
     end = done.y[:, -1].copy()

@@ -1,8 +1,8 @@
 """Coupled phases, eddy currents and spread (emulator/plant/coupled.h) against an independent integration of the same
 equations, against a closed form, and by an energy balance.
 
-Deviations are relative to the largest magnitude of the quantity in the run (speed and angle: to its change). Measured on
-x86-64 with gcc 12: at most 2e-7.
+Deviations are relative to the largest magnitude of the quantity in the run (speed and angle: to its change). Measured
+on x86-64 with gcc 12: at most 2e-7.
 """
 
 from __future__ import annotations
