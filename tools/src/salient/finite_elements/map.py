@@ -72,7 +72,8 @@ def neighbour_share(geometry: Geometry, flux_map: FluxMap, angles_deg: Sequence[
     pitch_rad = flux_map.pitch_rad
     seen_Wb, first_Wb = [], []
     for angle_deg in angles_deg:
-        position, potential, before_A = machine.at(angle_deg), None, 0.0
+        position, before_A = machine.at(angle_deg), 0.0
+        potential: np.ndarray | None = None
         for current_A in COUPLING_CURRENTS_A:
             start = None if potential is None else potential * (current_A / before_A)
             potential, before_A = position.solve(current_A, start), current_A
