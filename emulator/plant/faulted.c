@@ -146,18 +146,16 @@ void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
         const bool unbroken = !bit(plant->faults.winding_open, phase);
         const bool driven = path.link_gain * plant->bus_voltage_V > path.drop_V && unbroken;
         plant->path[phase] = (plant_path_t){0};
-        const bool open = current_A < PLANT_CURRENT_NEGLIGIBLE_A;
-        if (mutual && plant_has_loop(plant, phase)) { /* its current has either sign */
+        const bool either_sign = mutual && plant_has_loop(plant, phase); /* what the neighbours induce in its loop */
+        if (either_sign || current_A >= PLANT_CURRENT_NEGLIGIBLE_A || (driven && !mutual)) {
             conduct(plant, setting, phase, path, driven);
-        } else if (open && (mutual || !driven)) {
-            plant->current_A[phase] = 0.0;
-            if (mutual && unbroken && (path.sign >= 0.0)) {
-                setting->open[setting->open_count] = phase;
-                setting->open_sign[setting->open_count] = path.link_gain;
-                setting->open_drop_V[setting->open_count++] = path.drop_V;
-            }
-        } else {
-            conduct(plant, setting, phase, path, driven);
+            continue;
+        }
+        plant->current_A[phase] = 0.0;
+        if (mutual && unbroken && path.sign >= 0.0) {
+            setting->open[setting->open_count] = phase;
+            setting->open_sign[setting->open_count] = path.link_gain;
+            setting->open_drop_V[setting->open_count++] = path.drop_V;
         }
     }
     if (mutual) {
