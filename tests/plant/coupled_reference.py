@@ -56,7 +56,7 @@ class Coupled:
                    for gain, (_, slope), u in zip(self.gain, self.shapes(angle), mmf, strict=True))
 
     def currents(self, angle: float, fluxes: Array, carry: Sequence[int], guess: Array) -> Array:
-        """Of the phases `carry`, whose flux linkages are given; the others have none."""
+        """Currents of the phases `carry`, whose flux linkages are given; the others have none."""
         currents = np.zeros(self.phases)
         currents[carry] = guess[carry]
         for _ in range(60):
