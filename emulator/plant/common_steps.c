@@ -3,6 +3,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "plant/coupled.h"
 #include "plant/event_bracket.h"
 #include "plant/faulted.h"
 #include "plant/hermite.h"
@@ -41,6 +42,7 @@ static void find_link(plant_t *plant, integrator_setting_t *setting) {
 static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->machine = plant->machine;
     setting->magnetics = &plant->magnetics;
+    setting->coupled = plant->coupled.present ? &plant->coupled : NULL;
     setting->inertia_kg_m2 = plant->inertia_kg_m2;
     setting->friction_Nm_s = plant->friction_Nm_s;
     setting->load_torque_Nm = plant->load_torque_Nm;
@@ -49,6 +51,7 @@ static void find_setting(plant_t *plant, integrator_setting_t *setting) {
     setting->held_acceleration_rad_s2 = plant->held_acceleration_rad_s2;
     setting->supply_voltage_V = plant->supply_voltage_V;
     setting->ahead_rad = copysign(2.0 * MAGNETICS_SMOOTH_TOLERANCE_RAD, plant->speed_rad_s);
+    setting->link = false; /* until source and chopper are known */
     faulted_find_conducting(plant, setting);
     faulted_find_friction(plant, setting);
     setting->link = plant_has_link(plant);
@@ -134,11 +137,16 @@ static double step_to_event(const integrator_setting_t *setting, const integrato
     return at_s;
 }
 
+/* A phase's current, not below 0 but in a loop of a coupled machine. */
+static double least_current_A(const integrator_setting_t *setting, unsigned index, double current_A) {
+    return setting->coupled != NULL && setting->loop[index] ? current_A : max_double(current_A, 0.0);
+}
+
 /* After a step that ended at an event: sets a current that reached zero, or a DC-link voltage that reached a threshold,
  * exactly to that value. */
 static void snap_to_event(const integrator_setting_t *setting, integrator_state_t *end) {
     for (unsigned index = 0; index < setting->count; index++) {
-        end->current_A[index] = fmax(end->current_A[index], 0.0);
+        end->current_A[index] = least_current_A(setting, index, end->current_A[index]);
     }
     if (setting->friction_sign != 0.0 && fabs(end->speed_rad_s) < SPEED_TOLERANCE_RAD_S) {
         end->speed_rad_s = 0.0;
@@ -182,7 +190,7 @@ static void sample_step(plant_t *plant, const integrator_setting_t *setting, con
         for (unsigned index = 0; index < setting->count; index++) {
             const double at_A = hermite(x, step_s, start->current_A[index], first->current_A_s[index],
                                         end->current_A[index], last.current_A_s[index]);
-            plant->current_A[setting->phase[index]] = max_double(at_A, 0.0);
+            plant->current_A[setting->phase[index]] = least_current_A(setting, index, at_A);
         }
         plant_take_sample(plant);
         at_s = (double)(plant->observation.next_ns - time_ns) * S_PER_NS;
@@ -220,12 +228,18 @@ MAGNETICS_INLINE double step_length_s(plant_t *plant, const integrator_setting_t
             limit_s = plant->limits.current_A / slope_A_s;
         }
     }
+    if (setting->coupled != NULL) {
+        limit_s = min_double(limit_s, coupled_loop_step_s(plant, setting));
+    }
     double step_s = remaining_s;
     if (remaining_s > limit_s) {
         step_s = remaining_s / ceil(remaining_s / limit_s);
     }
     if (setting->count == 0) {
         return step_s;
+    }
+    if (setting->coupled != NULL) {
+        step_s = min_double(step_s, coupled_reversal_s(plant, setting, first));
     }
 
     const double angle_rad = plant->rotor_angle_rad, acceleration_rad_s2 = first->acceleration_rad_s2;

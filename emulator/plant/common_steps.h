@@ -1,4 +1,5 @@
-/* Steps of the plant in which all phases step together (integrator.h): for a plant with faults, and where a comparator
+/* Steps of the plant in which all phases step together (integrator.h): for a plant with faults or coupled phases,
+ * and where a comparator
  * responds. */
 #ifndef PLANT_COMMON_STEPS_H
 #define PLANT_COMMON_STEPS_H

@@ -2,6 +2,11 @@
 
 #include <math.h>
 
+#include "plant/coupled.h"
+
+/* An open phase whose voltage is below what is induced by less than this conducts: after the event of its beginning. */
+#define CONDUCTION_TOLERANCE_V 1e-6
+
 /* Devices that carry the current of one end of a winding. */
 typedef struct {
     bool rail; /* the end is where a switch that is on would put it */
@@ -55,53 +60,107 @@ static plant_path_t conducting_path(const plant_t *plant, unsigned phase) {
     }
     path.terminal_gain = 1.0 / (1.0 - shorted);
     path.terminal_S = shorted > 0.0 ? shorted / (winding_ohm * (1.0 - shorted)) : 0.0;
-    const double divider = 1.0 / (1.0 + path.device_ohm * path.terminal_S);
+    const double eddy_S = plant->coupled.eddy_S;
+    path.terminal_S += eddy_S * path.terminal_gain;
+    const double divider = 1.0 / (1.0 + path.device_ohm * path.terminal_S + winding_ohm * eddy_S);
     path.link_gain = divider * path.sign;
     path.drop_V = divider * (path.device_V + path.breakdown_V);
     path.resistance_ohm = divider * (winding_ohm + path.device_ohm * path.terminal_gain);
     return path;
 }
 
-/* The loop of shorted turns alone. */
+/* The loops of shorted turns and eddy currents alone. */
 static plant_path_t isolated_path(const plant_t *plant, unsigned phase) {
-    return (plant_path_t){.resistance_ohm = plant->winding_ohm[phase] / plant->faults.shorted_turns[phase]};
+    const double shorted = plant->faults.shorted_turns[phase], eddy_S = plant->coupled.eddy_S;
+    const double ohm =
+        eddy_S > 0.0 ? 1.0 / (shorted / plant->winding_ohm[phase] + eddy_S) : plant->winding_ohm[phase] / shorted;
+    return (plant_path_t){.resistance_ohm = ohm};
+}
+
+/* Adds a phase to the conducting ones. */
+static void conduct(plant_t *plant, integrator_setting_t *setting, unsigned phase, plant_path_t path, bool driven) {
+    const unsigned at = setting->count++;
+    const bool loop = plant_has_loop(plant, phase);
+    setting->path[at] = path;
+    setting->isolated[at] =
+        loop && !driven && plant_path_terminal_A(&path, plant->bus_voltage_V, plant->current_A[phase]) <= 0.0;
+    if (setting->isolated[at]) {
+        path = isolated_path(plant, phase);
+    }
+    plant->path[phase] = path;
+    setting->shorted |= loop;
+    setting->loop[at] = loop;
+    setting->turns[at] = plant->faults.shorted_turns[phase];
+    setting->phase[at] = phase;
+    /* Where it cannot end; the end of a loop's conduction: faulted_distance_to_event. */
+    setting->driven[at] = (driven && !plant->coupled.mutual) || loop;
+    setting->angle_offset_rad[at] = phase * plant->phase_offset_rad;
+    setting->link_sign[at] = path.link_gain;
+    setting->drop_V[at] = path.drop_V;
+    setting->resistance_ohm[at] = path.resistance_ohm;
+    setting->terminal_sign[at] = path.sign;
+    setting->terminal_gain[at] = path.terminal_gain;
+    setting->terminal_S[at] = path.terminal_S;
+}
+
+/* Makes open phases of a coupled machine conduct, whose voltage exceeds what the conducting ones induce; each of them
+ * changes that. */
+static void find_induced(plant_t *plant, integrator_setting_t *setting, const plant_path_t *paths) {
+    for (bool found = true; found && setting->open_count > 0;) {
+        integrator_state_t state = {plant->rotor_angle_rad, plant->speed_rad_s, plant->bus_voltage_V, {0.0}};
+        for (unsigned index = 0; index < setting->count; index++) {
+            state.current_A[index] = plant->current_A[setting->phase[index]];
+        }
+        integrator_derivative_t derivative;
+        coupled_differentiate(setting, &state, &derivative);
+        double least_V = CONDUCTION_TOLERANCE_V;
+        unsigned least = 0;
+        for (unsigned index = 0; index < setting->open_count; index++) {
+            const double blocking_V = coupled_blocking_V(setting, &state, &derivative, index);
+            if (blocking_V < least_V) {
+                least_V = blocking_V;
+                least = index;
+            }
+        }
+        found = least_V < CONDUCTION_TOLERANCE_V;
+        if (found) {
+            conduct(plant, setting, setting->open[least], paths[setting->open[least]], false);
+            setting->open_count--;
+            for (unsigned index = least; index < setting->open_count; index++) {
+                setting->open[index] = setting->open[index + 1];
+                setting->open_sign[index] = setting->open_sign[index + 1];
+                setting->open_drop_V[index] = setting->open_drop_V[index + 1];
+            }
+        }
+    }
 }
 
 void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting) {
-    unsigned count = 0;
+    plant_path_t paths[HAL_PHASES_MAX];
+    const bool mutual = plant->coupled.mutual;
+    setting->count = setting->open_count = 0;
     setting->shorted = false;
     for (unsigned phase = 0; phase < plant->machine->phases; phase++) {
-        const bool shorted = plant->faults.shorted_turns[phase] > 0.0;
         const double current_A = plant->current_A[phase];
-        plant_path_t path = conducting_path(plant, phase);
-        const bool driven =
-            path.link_gain * plant->bus_voltage_V > path.drop_V && !bit(plant->faults.winding_open, phase);
+        const plant_path_t path = paths[phase] = conducting_path(plant, phase);
+        const bool unbroken = !bit(plant->faults.winding_open, phase);
+        const bool driven = path.link_gain * plant->bus_voltage_V > path.drop_V && unbroken;
         plant->path[phase] = (plant_path_t){0};
-        if (!driven && current_A < PLANT_CURRENT_NEGLIGIBLE_A) {
-            plant->current_A[phase] = 0.0;
+        const bool either_sign = mutual && plant_has_loop(plant, phase); /* what the neighbours induce in its loop */
+        if (either_sign || current_A >= PLANT_CURRENT_NEGLIGIBLE_A || (driven && !mutual)) {
+            conduct(plant, setting, phase, path, driven);
             continue;
         }
-        setting->path[count] = path;
-        setting->isolated[count] =
-            shorted && !driven && plant_path_terminal_A(&path, plant->bus_voltage_V, current_A) <= 0.0;
-        if (setting->isolated[count]) {
-            path = isolated_path(plant, phase);
+        plant->current_A[phase] = 0.0;
+        if (mutual && unbroken && path.sign >= 0.0) {
+            setting->open[setting->open_count] = phase;
+            setting->open_sign[setting->open_count] = path.link_gain;
+            setting->open_drop_V[setting->open_count++] = path.drop_V;
         }
-        plant->path[phase] = path;
-        setting->shorted |= shorted;
-        setting->turns[count] = plant->faults.shorted_turns[phase];
-        setting->phase[count] = phase;
-        setting->driven[count] = driven || shorted; /* the end of its conduction: faulted_distance_to_event */
-        setting->angle_offset_rad[count] = phase * plant->phase_offset_rad;
-        setting->link_sign[count] = path.link_gain;
-        setting->drop_V[count] = path.drop_V;
-        setting->resistance_ohm[count] = path.resistance_ohm;
-        setting->terminal_sign[count] = path.sign;
-        setting->terminal_gain[count] = path.terminal_gain;
-        setting->terminal_S[count] = path.terminal_S;
-        count++;
     }
-    setting->count = count;
+    if (mutual) {
+        find_induced(plant, setting, paths);
+    }
 }
 
 void faulted_find_friction(plant_t *plant, integrator_setting_t *setting) {
@@ -132,10 +191,17 @@ double faulted_distance_to_event(const integrator_setting_t *setting, const inte
         nearest = setting->friction_sign * state->speed_rad_s;
     }
     for (unsigned index = 0; index < setting->count; index++) {
-        if (setting->turns[index] > 0.0) {
+        if (setting->loop[index]) {
             const double at_A =
                 plant_path_terminal_A(&setting->path[index], state->bus_voltage_V, state->current_A[index]);
             nearest = fmin(nearest, setting->isolated[index] ? -at_A : at_A);
+        }
+    }
+    if (setting->open_count > 0) {
+        integrator_derivative_t derivative;
+        coupled_differentiate(setting, state, &derivative);
+        for (unsigned index = 0; index < setting->open_count; index++) {
+            nearest = fmin(nearest, coupled_blocking_V(setting, state, &derivative, index));
         }
     }
     return nearest;
@@ -180,6 +246,7 @@ void faulted_add_energies(plant_t *plant, const integrator_setting_t *setting, c
         const plant_path_t *path = &setting->path[index];
         const double k = setting->turns[index], winding_ohm = plant->winding_ohm[setting->phase[index]];
         const double loop_J = k > 0.0 ? k / winding_ohm * e2 : 0.0;
+        plant->energy_iron_J += plant->coupled.eddy_S * e2;
         const double copper_J = (1.0 - k) * winding_ohm * current2_A2s + loop_J;
         const double converter_J = path->device_V * charge_As + path->device_ohm * current2_A2s;
         plant->energy_copper_J += copper_J;

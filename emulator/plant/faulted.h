@@ -39,8 +39,9 @@ void faulted_find_conducting(plant_t *plant, integrator_setting_t *setting);
 /* Adds the friction of the shaft to a setting whose other members are known. */
 void faulted_find_friction(plant_t *plant, integrator_setting_t *setting);
 
-/* Distance of a state from the next event that only faults have: end or beginning of conduction of a phase with
- * shorted turns (A), standstill of a shaft with friction (rad/s). Negative: past the event. */
+/* Distance of a state from the next event that only faults and coupled phases have: end or beginning of conduction of a
+ * phase with shorted turns or eddy currents (A), or of an open phase of a coupled machine (V), standstill of a shaft
+ * with friction (rad/s). Negative: past the event. */
 double faulted_distance_to_event(const integrator_setting_t *setting, const integrator_state_t *state);
 
 /* Distance of a state from a comparator's response, of the currents at the terminals; negative: past it. */

@@ -1,25 +1,13 @@
 #include "plant/integrator.h"
+
+#include <stddef.h>
+
+#include "plant/coupled.h"
+#include "plant/integrator_shaft.h"
 #include "plant/magnetics_kernel.h"
 
 /* The functions ending in _of are inlined for each form of the magnetics and for one and two conducting phases, so that
  * the compiler removes the other forms and unrolls the loops. `form`, `link` and `count` are the setting's. */
-
-/* Current that phases draw from the DC link, its first derivative at a constant voltage of the link, and its derivative
- * by that voltage, where some have shorted turns; link_A stays the current at the present voltage less the conductance
- * times that voltage. */
-static void terminal_currents(const integrator_setting_t *setting, const integrator_state_t *state,
-                              const integrator_derivative_t *derivative, double *link_A, double *link_A_s,
-                              double *conductance_S) {
-    *link_A = *link_A_s = *conductance_S = 0.0;
-    for (unsigned index = 0; index < setting->count; index++) {
-        const double by_current =
-            setting->terminal_gain[index] - setting->terminal_S[index] * setting->resistance_ohm[index];
-        const double sign = setting->terminal_sign[index];
-        *link_A += sign * (by_current * state->current_A[index] - setting->terminal_S[index] * setting->drop_V[index]);
-        *link_A_s += sign * by_current * derivative->current_A_s[index];
-        *conductance_S += sign * setting->terminal_S[index] * setting->link_sign[index];
-    }
-}
 
 MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magnetics_form_t form, bool link,
                                        unsigned count, const integrator_state_t *state,
@@ -45,33 +33,14 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
             link_A_s += setting->link_sign[index] * current_A_s;
         }
     }
-    const double friction_Nm_s = setting->friction_Nm_s, inverse_inertia = 1.0 / setting->inertia_kg_m2;
-    const double acceleration_rad_s2 =
-        setting->held ? setting->held_acceleration_rad_s2
-                      : (torque_Nm - friction_Nm_s * speed_rad_s - setting->load_torque_Nm) * inverse_inertia;
-    derivative->acceleration_rad_s2 = acceleration_rad_s2;
-    derivative->jerk_rad_s3 =
-        setting->held ? 0.0 : (torque_Nm_s - friction_Nm_s * acceleration_rad_s2) * inverse_inertia;
     derivative->torque_Nm = torque_Nm;
     derivative->torque_Nm_s = torque_Nm_s;
+    integrator_shaft(setting, speed_rad_s, derivative);
+    const double acceleration_rad_s2 = derivative->acceleration_rad_s2;
     derivative->link_V_s = 0.0;
     derivative->link_V_s2 = 0.0;
     if (link) {
-        const dc_link_t *dc_link = &setting->machine->dc_link;
-        double conductance_S = 0.0;
-        if (setting->shorted) {
-            terminal_currents(setting, state, derivative, &link_A, &link_A_s, &conductance_S);
-        }
-        if (setting->source_conducts) {
-            const double source_S = 1.0 / dc_link->source_resistance_ohm;
-            conductance_S += source_S;
-            link_A -= setting->supply_voltage_V * source_S;
-        }
-        if (setting->chopper_on) {
-            conductance_S += 1.0 / dc_link->chopper_resistance_ohm;
-        }
-        derivative->link_V_s = -(conductance_S * state->bus_voltage_V + link_A) / dc_link->capacitance_F;
-        derivative->link_V_s2 = -(conductance_S * derivative->link_V_s + link_A_s) / dc_link->capacitance_F;
+        integrator_link(setting, state, link_A, link_A_s, derivative);
     }
     for (unsigned index = 0; index < count; index++) {
         const magnetics_point_t *point = &points[index];
@@ -89,9 +58,9 @@ MAGNETICS_INLINE void differentiate_of(const integrator_setting_t *setting, magn
     }
 }
 
-MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_form_t form, bool link, unsigned count,
-                              const integrator_state_t *start, const integrator_derivative_t *first, double step_s,
-                              integrator_state_t *end, integrator_integrals_t *integrals) {
+MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_form_t form, bool coupled, bool link,
+                              unsigned count, const integrator_state_t *start, const integrator_derivative_t *first,
+                              double step_s, integrator_state_t *end, integrator_integrals_t *integrals) {
     integrator_state_t middle;
     integrator_derivative_t second;
     const double half_s = 0.5 * step_s, eighth_s2 = 0.125 * step_s * step_s, sixth_s2 = step_s * step_s * (1.0 / 6.0);
@@ -105,7 +74,11 @@ MAGNETICS_INLINE void step_of(const integrator_setting_t *setting, magnetics_for
         middle.current_A[index] =
             start->current_A[index] + half_s * first->current_A_s[index] + eighth_s2 * first->current_A_s2[index];
     }
-    differentiate_of(setting, form, link, count, &middle, &second);
+    if (coupled) {
+        coupled_differentiate(setting, &middle, &second);
+    } else {
+        differentiate_of(setting, form, link, count, &middle, &second);
+    }
 
     integrals->angle_rad =
         step_s * start->speed_rad_s + sixth_s2 * (first->acceleration_rad_s2 + 2.0 * second.acceleration_rad_s2);
@@ -165,18 +138,22 @@ MAGNETICS_INLINE void step_in(const integrator_setting_t *setting, magnetics_for
                               const integrator_state_t *start, const integrator_derivative_t *first, double step_s,
                               integrator_state_t *end, integrator_integrals_t *integrals) {
     if (setting->link) {
-        step_of(setting, form, true, setting->count, start, first, step_s, end, integrals);
+        step_of(setting, form, false, true, setting->count, start, first, step_s, end, integrals);
     } else if (setting->count == 1) {
-        step_of(setting, form, false, 1, start, first, step_s, end, integrals);
+        step_of(setting, form, false, false, 1, start, first, step_s, end, integrals);
     } else if (setting->count == 2) {
-        step_of(setting, form, false, 2, start, first, step_s, end, integrals);
+        step_of(setting, form, false, false, 2, start, first, step_s, end, integrals);
     } else {
-        step_of(setting, form, false, setting->count, start, first, step_s, end, integrals);
+        step_of(setting, form, false, false, setting->count, start, first, step_s, end, integrals);
     }
 }
 
 void integrator_differentiate(const integrator_setting_t *setting, const integrator_state_t *state,
                               integrator_derivative_t *derivative) {
+    if (setting->coupled != NULL) {
+        coupled_differentiate(setting, state, derivative);
+        return;
+    }
     switch (setting->magnetics->form) {
     case MAGNETICS_LINEAR_COSINE:
         differentiate_in(setting, MAGNETICS_LINEAR_COSINE, state, derivative);
@@ -196,6 +173,11 @@ void integrator_differentiate(const integrator_setting_t *setting, const integra
 void integrator_step(const integrator_setting_t *setting, const integrator_state_t *start,
                      const integrator_derivative_t *first, double step_s, integrator_state_t *end,
                      integrator_integrals_t *integrals) {
+    if (setting->coupled != NULL) {
+        step_of(setting, setting->magnetics->form, true, setting->link, setting->count, start, first, step_s, end,
+                integrals);
+        return;
+    }
     switch (setting->magnetics->form) {
     case MAGNETICS_LINEAR_COSINE:
         step_in(setting, MAGNETICS_LINEAR_COSINE, start, first, step_s, end, integrals);

@@ -41,12 +41,18 @@ typedef struct {
     double link_sign[HAL_PHASES_MAX];      /* +1 both switches on, 0 one, -1 none */
     double drop_V[HAL_PHASES_MAX];         /* of the two devices that carry the current */
     double resistance_ohm[HAL_PHASES_MAX]; /* of winding and devices */
+    /* See coupled.h: */
+    const coupled_t *coupled; /* NULL: the phases' magnetics are independent and equal */
+    unsigned open_count;      /* phases without current that a voltage might make conduct, their voltages as above */
+    unsigned open[HAL_PHASES_MAX];
+    double open_sign[HAL_PHASES_MAX], open_drop_V[HAL_PHASES_MAX];
     /* See faulted.h: */
-    bool shorted;         /* a phase has shorted turns: currents of the link by terminal_* */
+    bool shorted;         /* a phase has shorted turns or eddy currents: currents of the link by terminal_* */
     bool stuck;           /* friction holds the shaft; the next step may be another setting */
     double friction_sign; /* of the motion that Coulomb or static friction will stop; 0: none */
     double terminal_sign[HAL_PHASES_MAX], terminal_gain[HAL_PHASES_MAX], terminal_S[HAL_PHASES_MAX];
     double turns[HAL_PHASES_MAX]; /* shorted fraction */
+    bool loop[HAL_PHASES_MAX];    /* shorted turns or eddy currents */
     bool isolated[HAL_PHASES_MAX];
     plant_path_t path[HAL_PHASES_MAX]; /* while current flows at the terminals */
 } integrator_setting_t;

@@ -45,6 +45,16 @@ typedef struct {
     double inverter_capacity_J_K, inverter_resistance_K_W;
 } thermal_data_t;
 
+#define MACHINE_PHASES_MAX 6 /* as HAL_PHASES_MAX, for programs without the HAL */
+
+/* Properties of the magnetic circuit that the magnetics of one phase leave out (coupled.h); all zero: none. */
+typedef struct {
+    double coupling[MACHINE_PHASES_MAX];            /* of each phase with the next one, of the last with the first */
+    double eddy_conductance_S;                      /* of each phase */
+    double flux_deviation[MACHINE_PHASES_MAX];      /* flux linkage at the same angle and current: relative, > -1 */
+    double angle_deviation_deg[MACHINE_PHASES_MAX]; /* position of the aligned angle, mechanical */
+} circuit_t;
+
 typedef struct {
     const char *name;
     unsigned stator_poles;
@@ -55,6 +65,7 @@ typedef struct {
     double friction_Nm_s;
     double supply_voltage_V;
     magnetics_t magnetics;
+    circuit_t circuit;
     converter_t converter;
     dc_link_t dc_link;
     sensor_errors_t sensors;

@@ -12,7 +12,7 @@
  * The fourth form is a flux-linkage map over angle and current: flux_map.h.
  *
  * The phase angle theta is mechanical: 0 aligned, half a pole pitch (pi / Nr) unaligned; torque is positive from half a
- * pitch to a whole one. There is no mutual coupling between phases.
+ * pitch to a whole one. Coupling of phases: coupled.h.
  */
 #ifndef PLANT_MAGNETICS_H
 #define PLANT_MAGNETICS_H

@@ -21,7 +21,8 @@
  * 1.7 times as many instructions with the traditional controller and 3.2 times with paper and salient, whose phases
  * have edges at different times; plant, drive and bench together 1.2, 1.9 and 1.9 times (saturating machine, 40 kHz,
  * 600 r/min, 8 N m). These steps carry no faults, because they hold only where the flux linkage of a phase follows from
- * its voltage alone, at an inductance and a resistance that are its own: shorted turns tie the current of the terminals
+ * its voltage alone, at an inductance and a resistance that are its own: coupled phases (coupled.h) are tied to each
+ * other, shorted turns and eddy currents tie the current of the terminals
  * to the flux rate and to the link, friction at rest stops the shaft within a step, and a comparator opens all phases
  * at an instant that is found by shortening the step of all of them.
  *

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "plant/common_steps.h"
+#include "plant/coupled.h"
 #include "plant/faulted.h"
 #include "plant/min_max.h"
 #include "plant/phase_steps.h"
@@ -44,6 +45,9 @@ void plant_init(plant_t *plant, const machine_t *machine, double initial_angle_r
     }
     plant_set_gains(plant, &(plant_gains_t){1.0, 1.0, 1.0, 1.0});
     plant->phase_offset_rad = plant->magnetics.pitch_rad / machine->phases;
+    coupled_prepare(&plant->coupled, machine, plant->magnetics.pitch_rad);
+    plant->faulted = plant->coupled.present;
+    plant_set_step_factor(plant, 1.0);
     plant->smooth = SMOOTH_RANGE_EMPTY;
 }
 
@@ -141,7 +145,7 @@ void plant_set_faults(plant_t *plant, const plant_faults_t *faults) {
         sum += faults->shorted_turns[phase] + faults->earth_ohm[phase];
     }
     plant->faults = *faults;
-    plant->faulted = sum > 0.0;
+    plant->faulted = sum > 0.0 || plant->coupled.present;
     plant_set_step_factor(plant, plant->limits.factor);
 }
 

@@ -16,11 +16,13 @@
  * against the forward direction and independent of the speed (it can drive the shaft backwards). Phase 0 is aligned at
  * rotor angle 0. Phase currents are never negative. The current of the DC link is positive out of the link.
  *
- * Deliberately not modelled: mutual coupling of the phases and end effects; iron loss, hysteresis and eddy currents in
- * the machine, skin effect, temperature; switching times and losses of the devices (these bridges need no dead time:
- * their two switches are in series with the winding), inductance of the DC link, ripple of the supply's rectifier,
- * series resistance of the capacitor; elasticity of the shaft. Faults, friction at rest among them, change these
- * equations as faulted.h states.
+ * By the machine file: mutual coupling, eddy currents and spread of the phases, which change these equations as
+ * coupled.h states.
+ *
+ * Deliberately not modelled: end effects; hysteresis of the iron, skin effect, temperature of the magnetics; switching
+ * times and losses of the devices (these bridges need no dead time: their two switches are in series with the winding),
+ * inductance of the DC link, ripple of the supply's rectifier, series resistance of the capacitor; elasticity of the
+ * shaft. Faults, friction at rest among them, change these equations as faulted.h states.
  *
  * Integration: phase_steps.h, where every phase has steps of its own; with faults, and where a
  * comparator responds, common_steps.h, for currents, speed, angle and DC-link voltage together. Steps end at switching

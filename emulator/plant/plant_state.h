@@ -60,6 +60,17 @@ typedef struct {
     smooth_range_t smooth; /* of the rotor, in which its magnetics are smooth */
 } plant_phase_t;
 
+/* The machine's circuit_t, prepared; coupled.h has the equations. */
+typedef struct {
+    bool present; /* any of it */
+    bool mutual;  /* a coupling is not 0 */
+    unsigned phases;
+    double share[HAL_PHASES_MAX][HAL_PHASES_MAX]; /* of the current of a phase [1] on the poles of a phase [0] */
+    double gain[HAL_PHASES_MAX];                  /* flux linkage */
+    double offset_rad[HAL_PHASES_MAX];            /* position of each phase's aligned angle */
+    double eddy_S;
+} coupled_t;
+
 /* Limits of the length of a step at the present step factor. */
 typedef struct {
     double factor;                  /* plant_set_step_factor */
@@ -88,7 +99,7 @@ typedef struct plant {
     uint64_t time_ns;
     double speed_rad_s;
     double rotor_angle_rad;           /* unwrapped */
-    double current_A[HAL_PHASES_MAX]; /* with shorted turns: plant_current_A */
+    double current_A[HAL_PHASES_MAX]; /* with shorted turns or eddy currents: plant_current_A */
     double bus_voltage_V;
     uint8_t switches[HAL_PHASES_MAX]; /* that are on: HALF_BRIDGE_UPPER, HALF_BRIDGE_LOWER */
     bool chopper_on;
@@ -103,7 +114,7 @@ typedef struct plant {
     plant_faults_t faults; /* read only; plant_set_faults changes them */
 
     /* Energies since plant_init. Energy balance at every instant:
-     * drawn - returned = copper + converter + load + friction + fault
+     * drawn - returned = copper + converter + iron + load + friction + fault
      *                    + change of plant_field_energy_J + change of plant_kinetic_energy_J
      * supplied = source + chopper + drawn - returned + change of plant_link_energy_J (with a capacitor)
      */
@@ -111,6 +122,7 @@ typedef struct plant {
     double energy_returned_J;  /* to the link, both switches off */
     double energy_copper_J;    /* in the windings */
     double energy_converter_J; /* in the half bridges' devices */
+    double energy_iron_J;      /* by eddy currents */
     double energy_load_J;      /* work done on the load and the dynamometer */
     double energy_friction_J;
     double energy_fault_J;    /* in arcs and avalanches, and in a shaft that is locked */
@@ -133,7 +145,8 @@ typedef struct plant {
     double supply_voltage_V;
     bool held; /* plant_hold */
     double held_acceleration_rad_s2;
-    bool faulted; /* any of `faults` */
+    bool faulted; /* any of `faults` or of `coupled`: all phases step together */
+    coupled_t coupled;
     plant_path_t path[HAL_PHASES_MAX];
     half_bridge_pattern_t pattern[HAL_PHASES_MAX]; /* of the control period that began at pattern_ns */
     uint64_t pattern_ns;
@@ -170,6 +183,11 @@ double plant_link_energy_J(const plant_t *plant);
 /* The DC link has a capacitor: its voltage is a state. */
 static inline bool plant_has_link(const plant_t *plant) {
     return plant->machine->dc_link.capacitance_F > 0.0;
+}
+
+/* The phase has shorted turns or eddy currents: its current_A is not the terminals'. */
+static inline bool plant_has_loop(const plant_t *plant, unsigned phase) {
+    return plant->faults.shorted_turns[phase] > 0.0 || plant->coupled.eddy_S > 0.0;
 }
 
 /* Current at the terminals of a phase with faults, by the current of its turns. */

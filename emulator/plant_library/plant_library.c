@@ -20,6 +20,7 @@ typedef struct {
     double energy_converter_J, energy_supplied_J, energy_source_J, energy_chopper_J;
     double link_energy_J;
     double energy_fault_J;
+    double energy_iron_J;
 } plant_library_state_t;
 
 plant_t *plant_library_create(const machine_t *machine, double initial_angle_rad);
@@ -85,6 +86,7 @@ void plant_library_read(const plant_t *plant, plant_library_state_t *state) {
     state->energy_chopper_J = plant->energy_chopper_J;
     state->link_energy_J = plant_link_energy_J(plant);
     state->energy_fault_J = plant->energy_fault_J;
+    state->energy_iron_J = plant->energy_iron_J;
 }
 
 /* magnetics_evaluate for a machine. */

@@ -55,6 +55,15 @@ class Magnetics(ctypes.Structure):
     ]
 
 
+class Circuit(ctypes.Structure):
+    _fields_ = [
+        ("coupling", ctypes.c_double * PHASES_MAX),
+        ("eddy_conductance_S", ctypes.c_double),
+        ("flux_deviation", ctypes.c_double * PHASES_MAX),
+        ("angle_deviation_deg", ctypes.c_double * PHASES_MAX),
+    ]
+
+
 class Converter(ctypes.Structure):
     _fields_ = [
         ("switch_drop_V", ctypes.c_double),
@@ -105,6 +114,7 @@ class Machine(ctypes.Structure):
         ("friction_Nm_s", ctypes.c_double),
         ("supply_voltage_V", ctypes.c_double),
         ("magnetics", Magnetics),
+        ("circuit", Circuit),
         ("converter", Converter),
         ("dc_link", DcLink),
         ("sensors", SensorErrors),
@@ -134,6 +144,7 @@ class State(ctypes.Structure):
         ("energy_chopper_J", ctypes.c_double),
         ("link_energy_J", ctypes.c_double),
         ("energy_fault_J", ctypes.c_double),
+        ("energy_iron_J", ctypes.c_double),
     ]
 
 

@@ -205,6 +205,14 @@ ZERO_ALLOWED -= {("sensors", "current_limit_A"), ("sensors", "current_gain")}
 ZERO_ALLOWED -= {("drive", key) for key in GOOD_TABLES["drive"] if key != "encoder_bits"}
 ZERO_ALLOWED -= {("drive.parameters", "current_trip_A"), ("drive.parameters", "pulses_per_period")}
 
+BEYOND_THE_CIRCUIT = {
+    "coupling.neighbours": ("1.5", "-0.3", "nan", "[0.1, 0.1]", "[0.1, 0.1, true]", '"0.1"'),
+    "eddy_current.conductance_S": ("1e-9", "0.15", "0.3", "-1e-3", "[1e-3]"),
+    "spread.flux_linkage": ("[0.3, 0, 0]", "[0, 0]", "false"),
+    "spread.angle_deg": ("[0, 0, -2.1]", "inf"),
+}
+"""Values that no magnetic circuit of three phases has, by the key that the rejection names."""
+
 Case = tuple[str, str, str]
 """(what was done, machine file, what the rejection must name)."""
 
@@ -255,6 +263,8 @@ def other_cases() -> list[Case]:
         ("name removed", toml(GOOD_TABLES).split("\n", 1)[1], "name"),
         *((f"name {value[:20]}", toml(GOOD_TABLES, value), "name")
           for value in ("3", "true", '""', '"a b"', '"../x"', '"1a"', '"m\\u00fcller"', '"a\\nb"', f'"{"-" * 5000}"')),
+        *((f"{key} = {value}", GOOD + f"[{key.partition('.')[0]}]\n{key.partition('.')[2]} = {value}\n", key)
+          for key, values in BEYOND_THE_CIRCUIT.items() for value in values),
         ("a key of two lines", GOOD.replace("resistance_ohm", '"a\\nb"', 1), "winding"),
         ("a key of 5000 letters", GOOD.replace("resistance_ohm", "x" * 5000, 1), "winding"),
         ("a table of two lines", GOOD + '["a\\nb"]\n', "unknown key"),

@@ -16,7 +16,8 @@ PAGE = (ROOT / "docs" / "machines" / "file.md").read_text(encoding="utf-8")
 
 def test_reference_lists_exactly_the_keys_of_a_machine_file():
     tables = [machine.Poles, machine.Winding, machine.Mechanics, machine.Converter, machine.DcLink, machine.Sensors,
-              machine.IronLoss, machine.Thermal, machine.Drive, *machine.MAGNETICS.values()]
+              machine.Coupling, machine.EddyCurrent, machine.Spread, machine.IronLoss, machine.Thermal, machine.Drive,
+              *machine.MAGNETICS.values()]
     keys = {key for table in tables for key in table.model_fields} | {"name"}
     table = PAGE.partition("## Keys")[2].partition("\n## ")[0]
     rows = [row.split("|")[2] for row in table.splitlines() if row.startswith("| ") and "---" not in row]

@@ -1,6 +1,7 @@
 """The flux-linkage map of tools/machines/finite_element.csv, computed from a geometry and a magnetisation curve.
 
     build/venv/bin/python -m salient.finite_elements OUT.csv
+    build/venv/bin/python -m salient.finite_elements --coupling
 
 The field at every position and current by solver.py, on the cross section of mesh.py (its Geometry), with
 the steel of steel.py. machine_data gives the motor's other keys in that machine's file. Takes about four
@@ -20,12 +21,18 @@ import numpy as np
 from salient.finite_elements import steel
 from salient.finite_elements.mesh import COIL_PLUS, IRON, Geometry
 from salient.finite_elements.solver import Machine
+from salient.machine.file import load_machine
+from salient.machine.flux_map import FluxMap
+from salient.paths import MACHINES
 from salient.workers import process_pool
 
 ANGLE_STEP_DEG = 0.5
 
 # Closer where the iron saturates.
 CURRENTS_A = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 25, 28, 32, 36, 40, 45, 50, 56, 62, 68, 74, 80)
+
+COUPLING_ANGLES_DEG = tuple(range(0, 60, 5))
+COUPLING_CURRENTS_A = (5, 10, 20, 40, 60)
 
 # Copper at 75 deg C; of a coil side's area the conductors fill this fraction.
 _COPPER_OHM_M = 2.1e-8
@@ -51,6 +58,35 @@ def solutions(machine: Machine, angle_deg: float,
 def flux_linkages_Wb(geometry: Geometry, angle_deg: float) -> list[float]:
     """At the currents CURRENTS_A."""
     return [flux_Wb for flux_Wb, _ in solutions(Machine(geometry), angle_deg)]
+
+
+def neighbour_share(geometry: Geometry, flux_map: FluxMap, angles_deg: Sequence[float] = COUPLING_ANGLES_DEG
+                    ) -> tuple[float, float]:
+    """Key coupling.neighbours of a machine file, of phases on two poles of one polarity, and the RMS deviation from
+    the field's flux linkage of the other phase, relative to the largest of these.
+
+    A phase alone, at a current i, gives its neighbour k (psi(theta, i) + L(theta') i) to first order in the share k
+    (emulator/plant/coupled.h), with its own flux linkage psi and the neighbour's inductance L: k by least squares.
+    """
+    machine = Machine(geometry)
+    pitch_rad = flux_map.pitch_rad
+    seen_Wb, first_Wb = [], []
+    for angle_deg in angles_deg:
+        position, before_A = machine.at(angle_deg), 0.0
+        potential: np.ndarray | None = None
+        for current_A in COUPLING_CURRENTS_A:
+            start = None if potential is None else potential * (current_A / before_A)
+            potential, before_A = position.solve(current_A, start), current_A
+            other_deg = angle_deg - 360.0 / geometry.stator_poles
+            own, inductance_H = (
+                float(flux_map.flux_linkage_Wb(math.remainder(math.radians(angle), pitch_rad), of_A)) / of_A
+                for angle, of_A in ((angle_deg, current_A), (other_deg, COUPLING_CURRENTS_A[0])))
+            seen_Wb.append(position.flux_linkage_of_Wb(1, potential))
+            first_Wb.append((own + inductance_H) * current_A)
+    seen, first = np.array(seen_Wb), np.array(first_Wb)
+    share = float(seen @ first / (first @ first))
+    deviation = float(np.sqrt(np.mean((seen - share * first) ** 2)) / np.abs(seen).max())
+    return share, deviation
 
 
 def machine_data(geometry: Geometry) -> dict[str, float]:
@@ -111,8 +147,14 @@ def csv_text(geometry: Geometry) -> str:
 
 def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
-        print("usage: python -m salient.finite_elements OUT.csv", file=sys.stderr)
+        print("usage: python -m salient.finite_elements OUT.csv | --coupling", file=sys.stderr)
         return 2
+    if arguments[0] == "--coupling":
+        magnetics = load_machine(MACHINES / "finite_element.toml").magnetics
+        assert isinstance(magnetics, FluxMap)
+        share, deviation = neighbour_share(Geometry(), magnetics)
+        print(f"neighbours = {share:.4g}, {100.0 * deviation:.2g} % RMS of the largest mutual flux linkage")
+        return 0
     Path(arguments[0]).write_text(csv_text(Geometry()), encoding="utf-8")
     for key, value in machine_data(Geometry()).items():
         print(f"{key} = {value:.5g}")

@@ -8,10 +8,12 @@ flux leaves the stator outwards or enters the shaft. Two dimensions: the field a
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from salient.finite_elements.mesh import COIL_MINUS, COIL_PLUS, FINE_DEG, IRON, Geometry, build_mesh
 from salient.finite_elements.steel import MU_0, Laminations
@@ -19,6 +21,7 @@ from salient.finite_elements.steel import MU_0, Laminations
 # Reduction of the Newton iteration's first residual; the flux linkage's error is of the order of its square.
 _RESIDUAL = 1e-7
 _ITERATIONS_MAX = 60
+_SAME_PLACE_M = 1e-6
 
 
 class FieldError(RuntimeError):
@@ -38,17 +41,31 @@ class Machine:
         self.iron = np.flatnonzero(mesh.region == IRON)
         # Integral of the products of the shape functions' gradients.
         self.stiffness_m0 = np.einsum("tia,tja,t->tij", mesh.gradients, mesh.gradients, mesh.area_m2)
-        # Integral of turns a square metre times shape function.
-        self.source_turns = np.zeros(mesh.triangles.shape)
-        for region, sign in ((COIL_PLUS, 1.0), (COIL_MINUS, -1.0)):
-            side = mesh.region == region
-            density = sign * geometry.turns / mesh.area_m2[side].sum()
-            self.source_turns[side] = density * mesh.area_m2[side, None] / 3.0
+        self.source_turns = self.source_of(0)
         # The air between the circles that the faces of the poles are on.
         radius_m = np.hypot(*mesh.centre_m.T)
         self.gap = np.flatnonzero(
             (radius_m > geometry.rotor_radius * 1e-3) & (radius_m < geometry.bore_radius * 1e-3)
         )
+
+    @cache  # noqa: B019 - machines are few, and live as long as the program
+    def source_of(self, pole: int) -> np.ndarray:
+        """Integral of turns a square metre times shape function, by triangle and corner, of the coil on a pole;
+        0 is the excited one, poles are counted forwards, of one polarity within half a turn."""
+        mesh = self.mesh
+        turn = 2.0 * math.pi * pole / self.geometry.stator_poles
+        cosine, sine = math.cos(turn), math.sin(turn)
+        source = np.zeros(mesh.triangles.shape)
+        for region, sign in ((COIL_PLUS, 1.0), (COIL_MINUS, -1.0)):
+            side = np.flatnonzero(mesh.region == region)
+            place = mesh.centre_m[side] @ np.array([[cosine, sine], [-sine, cosine]])
+            half = np.where(place[:, 0] < 0.0, -1.0, 1.0)  # beyond the half that has a mesh
+            distance, found = cKDTree(mesh.centre_m).query(place * half[:, None])
+            if distance.max() > _SAME_PLACE_M:
+                raise ValueError(f"the mesh at pole {pole} is another one")
+            density = sign * self.geometry.turns / mesh.area_m2[side].sum()
+            np.add.at(source, found, (half * density * mesh.area_m2[side] / 3.0)[:, None] * np.ones(3))
+        return source
 
     def at(self, angle_deg: float) -> Position:
         """The machine with its rotor turned from the aligned position by a whole number of steps."""
@@ -103,6 +120,10 @@ class Position:
     def flux_linkage_Wb(self, potential: np.ndarray) -> float:
         """Flux linkage of the phase, both coils. Its weights are the current's: its integral is the co-energy."""
         return 2.0 * self._machine.length_m * float(self._source @ potential)
+
+    def flux_linkage_of_Wb(self, pole: int, potential: np.ndarray) -> float:
+        """Flux linkage of the phase with a coil on another pole (Machine.source_of)."""
+        return 2.0 * self._machine.length_m * float(self._gather(self._machine.source_of(pole)) @ potential)
 
     def torque_Nm(self, potential: np.ndarray) -> float:
         """By Maxwell's stress, averaged over the air gap (A. Arkkio, Analysis of Induction Motors Based on the

@@ -31,6 +31,9 @@ RISE_MAX = 2.0
 """Rise of the current in a control period by the full voltage, in peak currents."""
 GAIN_MAX = 0.25
 """Speed gained in a control period with the peak torque, in base speeds."""
+EDDY_TIME_CONSTANT_S = (1e-7, 1e-4)
+"""Time in which the flux of an open, unaligned phase decays. Laminations of 0.2 to 0.65 mm have 0.5 to 20 us; what is
+far below a switching edge has no effect."""
 BASE_SPEED_MIN_RPM = 10.0
 """The least over_speed_rpm (firmware/storage/parameters.def)."""
 CURRENT_RANGE_MAX, VOLTAGE_RANGE_MAX = 32.0, 16.0
@@ -367,5 +370,17 @@ _RULES_OF_HEAT = (
          when=lambda of: of.is_map or "magnetics.saturated_inductance_H" in of),
 )
 
+_RULES_OF_EDDY_CURRENTS = (
+    Rule("eddy_current.conductance_S", lambda of: EDDY_TIME_CONSTANT_S[1] / of.machine.magnetics.unaligned_inductance_H,
+         f"or the flux of an open phase would take more than {EDDY_TIME_CONSTANT_S[1]:g} s to decay, by",
+         lambda of: of.inductance_key),
+    Rule("eddy_current.conductance_S", lambda of: EDDY_TIME_CONSTANT_S[0] / of.machine.magnetics.unaligned_inductance_H,
+         f"or the flux of an open phase would decay within {EDDY_TIME_CONSTANT_S[0]:g} s, without effect, by",
+         lambda of: of.inductance_key, least=True, when=lambda of: of["eddy_current.conductance_S"] > 0.0),
+    Rule("eddy_current.conductance_S", lambda of: of["current_peak_A"] / of["converter.supply_voltage_V"],
+         "or eddy currents alone would be {current_peak_A} at", "converter.supply_voltage_V"),
+)
+
 RULES = (*_RULES_OF_MAGNETICS, *_RULES_OF_VOLTAGE, *_RULES_OF_CURRENT, *_RULES_OF_TORQUE, *_RULES_OF_SPEED,
-         *_RULES_OF_ANGLES, *_RULES_OF_HEAT)
+         *_RULES_OF_ANGLES, *_RULES_OF_HEAT,
+         *_RULES_OF_EDDY_CURRENTS)

@@ -26,6 +26,8 @@ class Machine:
     friction_Nm_s: float
     supply_voltage_V: float
     magnetics: Formula | FluxMap
+    circuit: dict[str, Any]
+    """See salient.machine.circuit."""
     converter: dict[str, float]
     """Every key of Converter but supply_voltage_V."""
     dc_link: dict[str, float] | None

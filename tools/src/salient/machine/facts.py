@@ -19,7 +19,7 @@ MAP_FILE = "magnetics.file"
 
 _UNITS = {"_ohm": "ohm", "_V": "V", "_A": "A", "_H": "H", "_Wb": "Wb", "_Nm": "N m", "_rpm": "r/min", "_hz": "Hz",
           "_F": "F", "_deg": "deg", "_s": "s", "_C": "C", "_m2": "m^2", "_K_W": "K/W", "_J_K": "J/K",
-          "_Nm_s": "N m s", "_kg_m2": "kg m^2"}  # fmt: skip
+          "_Nm_s": "N m s", "_kg_m2": "kg m^2", "_S": "S"}  # fmt: skip
 
 
 def unit_of(name: str) -> str:
@@ -41,6 +41,7 @@ class Facts:
                   "poles": {"stator": machine.stator_poles, "rotor": machine.rotor_poles},
                   "converter": {"supply_voltage_V": machine.supply_voltage_V, **machine.converter},
                   "magnetics": getattr(machine.magnetics, "parameters", {"file": 0.0}),
+                  "eddy_current": {"conductance_S": machine.circuit["eddy_conductance_S"]},
                   "dc_link": machine.dc_link or {}, "sensors": machine.sensors, "iron_loss": machine.iron_loss or {},
                   "thermal": machine.thermal, "drive": machine.drive, "drive.parameters": machine.drive_parameters}
         self._stated: dict[str, float] = {f"{table}.{key}": value for table, keys in tables.items()

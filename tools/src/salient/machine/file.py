@@ -15,6 +15,7 @@ from pydantic import Field, create_model
 
 from salient.dbc import PHASES_MAX, PHASES_MIN
 from salient.errors import close_names, shown
+from salient.machine.circuit import Coupling, EddyCurrent, Spread, circuit_of
 from salient.machine.contradictions import contradiction
 from salient.machine.definition import Machine, MachineError
 from salient.machine.facts import Facts
@@ -148,6 +149,9 @@ class MachineFile(Table):
     magnetics: dict[str, Any]
     converter: Converter
     dc_link: DcLink | None = None
+    coupling: Coupling | None = None
+    eddy_current: EddyCurrent | None = None
+    spread: Spread = Spread()
     sensors: Sensors = Sensors()
     iron_loss: IronLoss | None = None
     thermal: Thermal = Thermal()
@@ -188,6 +192,7 @@ def _machine(file: MachineFile, poles: tuple[int, int, int], magnetics: Formula 
         **file.mechanics.model_dump(),
         supply_voltage_V=file.converter.supply_voltage_V,
         magnetics=magnetics,
+        circuit=circuit_of(file.coupling, file.eddy_current, file.spread, phases),
         converter=file.converter.model_dump(exclude={"supply_voltage_V"}),
         dc_link=None if file.dc_link is None else file.dc_link.model_dump(exclude_none=True),
         sensors=file.sensors.model_dump(),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from salient.dbc import database_hash
+from salient.dbc import PHASES_MAX, database_hash
 from salient.machine.content import machine_hash
 from salient.machine.file import FORMS, Converter, DcLink, Machine, Sensors, Thermal
 from salient.machine.firmware_tables import (
@@ -224,6 +224,11 @@ def _magnetics(machine: Machine, scaling: Scaling) -> Mapping[str, float]:
     return machine.magnetics.parameters
 
 
+def _of_phases(values: tuple[float, ...]) -> list[float]:
+    """Values of every phase, with zeros up to the size of the array."""
+    return [*values, *[0.0] * (PHASES_MAX - len(values))]
+
+
 def _doubles(part: str, keys: Any, values: Callable[[Machine, Scaling], Mapping[str, float] | None]
              ) -> tuple[Member, ...]:
     """The members of a nested structure; those that a machine does not have are 0."""
@@ -244,6 +249,13 @@ PLANT = Structure("machine_t", (
     Member("supply_voltage_V", "double", lambda machine, scaling: machine.supply_voltage_V),
     Member("magnetics.form", "magnetics_form_t", lambda machine, scaling: FORMS.index(machine.magnetics.form)),
     *_doubles("magnetics", _MAGNETICS_KEYS, _magnetics),
+    Member("circuit.coupling", "double", lambda machine, scaling: _of_phases(machine.circuit["coupling"]),
+           (PHASES_MAX,)),
+    Member("circuit.eddy_conductance_S", "double", lambda machine, scaling: machine.circuit["eddy_conductance_S"]),
+    Member("circuit.flux_deviation", "double", lambda machine, scaling: _of_phases(machine.circuit["flux_deviation"]),
+           (PHASES_MAX,)),
+    Member("circuit.angle_deviation_deg", "double", lambda machine, scaling: _of_phases(
+        machine.circuit["angle_deviation_deg"]), (PHASES_MAX,)),
     *_doubles("converter", [key for key in Converter.model_fields if key != "supply_voltage_V"],
               lambda machine, scaling: machine.converter),
     *_doubles("dc_link", DcLink.model_fields, lambda machine, scaling: machine.dc_link),
