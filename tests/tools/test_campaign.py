@@ -78,7 +78,7 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
     violations = [{"rule": "gate_on", "number": 1, "at_us": 5}, {"rule": "no_command", "number": 2, "at_us": 7}]
     saved = {}
 
-    def save(seed: int, violation: str, folder: Path, healthy: bool) -> dict[str, object]:
+    def save(seed: int, violation: str, folder: Path, kind: str) -> dict[str, object]:
         saved[folder.name] = violation
         return {"world": {"events": []}, "replay": f"tools/salient replay {folder}"}
 
@@ -94,7 +94,7 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
 
 def test_a_worker_with_another_build_ends_the_campaign() -> None:
     with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
-        serve((1, False, "digest of another build"))
+        serve((1, "faults", "digest of another build"))
 
 
 def test_the_programs_are_the_same_bytes_wherever_the_clone_is() -> None:
@@ -134,7 +134,7 @@ def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) 
 @pytest.mark.in_turns
 @pytest.mark.parametrize("seed", [13, 19, 39, 87, 1584])
 def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
-    result = run_world(seed, healthy=True)
+    result = run_world(seed, kind="healthy")
     assert result["violations"] == [] and result["causes"] == []
     assert 300_000 < result["virtual_us"] < 4_000_000
 
