@@ -190,6 +190,34 @@ TEST_F(PositionLoop, end_stops_of_a_set_point_are_within_those_of_the_parameters
     EXPECT_TRUE(position.status.limited);
 }
 
+TEST_F(PositionLoop, other_end_stops_move_no_rotor_that_rests_and_shorten_a_move) {
+    order(POSITION_ORDER_PROFILE, 3.0);
+    ticks(2000);
+    command.highest = int64_t(REV_48); // behind the rotor
+    ticks(500);
+    EXPECT_NEAR(rotor_rev, 3.0, 1e-6);
+    command.highest = int64_t(8.0 * REV_48);
+    order(POSITION_ORDER_PROFILE, 10.0);
+    ticks(200);
+    EXPECT_FALSE(position.status.limited);
+    command.highest = int64_t(8.0 * REV_48);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 8.0, 1e-6);
+    EXPECT_TRUE(position.status.limited);
+    order(POSITION_ORDER_PROFILE, 20.0);
+    ticks(250); // on the way, at speed
+    command.highest = int64_t(9.0 * REV_48);
+    const double from = rotor_rev;
+    EXPECT_GT(from, 9.5);
+    ticks(3000);
+    EXPECT_GT(rotor_rev, from - 0.1) << "passed: it stops, and does not return to the stop";
+    EXPECT_LT(rotor_rev, 19.0);
+    order(POSITION_ORDER_PROFILE, 20.0);
+    command.highest = int64_t(9.0 * REV_48);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 9.0, 1e-6) << "a new set point";
+}
+
 TEST_F(PositionLoop, the_period_of_a_set_point_replaces_the_parameters) {
     position_set_point_t set_point = {};
     EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14).cycle.ticks, 4u);
