@@ -393,6 +393,21 @@ TEST_F(CanopenDrive, a_consumer_without_node_or_time_is_none_and_a_node_is_watch
     EXPECT_NE(canopen.drive.state, CANOPEN_OPERATION_ENABLED) << "an entry that is not used replaces no supervision";
 }
 
+TEST_F(CanopenDrive, long_guard_times_are_not_short_ones) {
+    for (const auto &[time_ms, factor] : {std::pair{61357, 70}, {65535, 255}, {60000, 72}}) { // 2^32 us and some ms
+        go(CANOPEN_SWITCHED_ON);
+        write(0x100C, 0, time_ms);
+        write(0x100D, 0, factor);
+        control(ENABLE);
+        receive(0x700 + NODE, {}, true);
+        for (unsigned i = 0; i < 40; i++) {
+            cycle(1000);
+            receive(0x80, {}); // any sign against the silence of all
+        }
+        expect_state(CANOPEN_OPERATION_ENABLED, "guarded");
+    }
+}
+
 TEST_F(CanopenDrive, other_losses_of_the_master) {
     const canopen_state_t after[] = {CANOPEN_FAULT_REACTION, CANOPEN_SWITCH_ON_DISABLED, CANOPEN_QUICK_STOP_ACTIVE};
     for (int32_t option : {1, 2, 3}) {
