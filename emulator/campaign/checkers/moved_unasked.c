@@ -5,6 +5,7 @@
 
 #define MOVED_REV 0.03 /* a load, until it is held */
 #define COUNTS 3.0
+#define AT_REST_RAD_S 1.0
 
 typedef struct {
     bool held;
@@ -29,8 +30,8 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
         state->held = false;
         return;
     }
-    if (!state->held) {
-        *state = (state_t){.held = true, .position_rev = position_rev};
+    if (!state->held) { /* a rotor that turned when the drive was enabled comes to rest first */
+        *state = (state_t){.held = fabs(seen->plant->speed_rad_s) < AT_REST_RAD_S, .position_rev = position_rev};
     }
     const double moved_rev = position_rev - state->position_rev;
     if (fabs(moved_rev) > MOVED_REV + COUNTS * facts_count_rev(seen)) {

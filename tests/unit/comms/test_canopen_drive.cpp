@@ -255,6 +255,25 @@ TEST_F(CanopenDrive, a_quick_stop_ends_at_rest_with_the_switches_open) {
     expect_state(CANOPEN_SWITCH_ON_DISABLED, "enable alone");
 }
 
+TEST_F(CanopenDrive, a_stop_begins_with_a_rotor_that_has_not_reached_its_demand) {
+    for (const unsigned word : {QUICK_STOP, SWITCH_ON}) {
+        for (const int32_t sign : {1, -1}) {
+            go(CANOPEN_OPERATION_ENABLED);
+            write(0x6083, 0, 1000000);
+            write(0x60FF, 0, sign * 3000);
+            values.motion.speed_rpm = sign * 100000;
+            cycle(10);
+            EXPECT_EQ(int32_t(read(0x606B, 0)), sign * 3000);
+            control(word);
+            cycle(2);
+            EXPECT_LE(std::abs(int32_t(read(0x606B, 0))), 100);
+            EXPECT_GE(std::abs(int32_t(read(0x606B, 0))), 80) << "by its ramp";
+            values.motion.speed_rpm = 0;
+            cycle(200);
+        }
+    }
+}
+
 TEST_F(CanopenDrive, a_load_that_turns_the_rotor_does_not_keep_a_stop_from_ending) {
     enable();
     control(QUICK_STOP);
