@@ -213,10 +213,10 @@ static bool parse_flag(arguments_t *arguments, const char *option) {
     const struct {
         const char *name;
         bool *to;
-    } flags[] = {
-        {"--healthy", &arguments->healthy},
+    } flags[] = {{"--healthy", &arguments->healthy},
                  {"--motion", &arguments->motion},
-                 {"--describe", &arguments->describe}, {"--serve", &arguments->serve}};
+                 {"--describe", &arguments->describe},
+                 {"--serve", &arguments->serve}};
     for (unsigned i = 0; i < sizeof flags / sizeof *flags; i++) {
         if (strcmp(option, flags[i].name) == 0) {
             return *flags[i].to = true;

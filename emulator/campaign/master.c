@@ -128,8 +128,8 @@ static void put_orders(sender_t *sender, const transport_receiver_t *receiver) {
     put(sender, receiver, SENDER_HONEST, 0x200 + MASTER_NODE,
         orders.word | (uint64_t)orders.mode << 16 | (uint64_t)(uint32_t)orders.position << 24, 7);
     if (orders.mode == MODE_PV || orders.mode == MODE_CSV) {
-        put(sender, receiver, SENDER_HONEST, 0x400 + MASTER_NODE, orders.word | (uint64_t)(uint32_t)orders.velocity << 16,
-            6);
+        put(sender, receiver, SENDER_HONEST, 0x400 + MASTER_NODE,
+            orders.word | (uint64_t)(uint32_t)orders.velocity << 16, 6);
     } else if (orders.mode == MODE_TQ || orders.mode == MODE_CST) {
         put(sender, receiver, SENDER_HONEST, 0x500 + MASTER_NODE, orders.word | (uint64_t)(uint16_t)orders.torque << 16,
             4);

@@ -1,9 +1,9 @@
-/* A CANopen master of a world: it writes its setting by SDO, starts the drive by the NMT, and sends controlword, mode and
- * references in receive PDOs each cycle, by the statusword that it hears, as a PLC does. Beside it, while the world has
- * them, a second master and a node that sends random frames of every service.
+/* A CANopen master of a world: it writes its setting by SDO, starts the drive by the NMT, and sends controlword, mode
+ * and references in receive PDOs each cycle, by the statusword that it hears, as a PLC does. Beside it, while the world
+ * has them, a second master and a node that sends random frames of every service.
  *
- * What all of them ask for is followed by their frames on the bus, as a device of CiA 402 may at most take it. Shares no
- * code with the firmware. */
+ * What all of them ask for is followed by their frames on the bus, as a device of CiA 402 may at most take it. Shares
+ * no code with the firmware. */
 #ifndef CAMPAIGN_MASTER_H
 #define CAMPAIGN_MASTER_H
 
@@ -13,8 +13,8 @@
 #include "campaign/world.h"
 #include "rig/transport.h"
 
-#define MASTER_NODE 1u    /* of the drive */
-#define MASTER_OWN 0x7Fu  /* of the master */
+#define MASTER_NODE 1u        /* of the drive */
+#define MASTER_OWN 0x7Fu      /* of the master */
 #define MASTER_UNITS 131072.0 /* of position in a revolution, by default */
 
 /* Modes of CiA 402. */
@@ -33,9 +33,9 @@ typedef enum {
 
 /* The drive by its frames. */
 typedef struct {
-    bool heard;      /* a statusword, */
-    uint16_t status; /* the last one */
-    bool placed;     /* a position, */
+    bool heard;       /* a statusword, */
+    uint16_t status;  /* the last one */
+    bool placed;      /* a position, */
     int32_t position; /* the last one */
     uint64_t placed_ns, status_ns;
 } master_drive_t;
@@ -43,35 +43,35 @@ typedef struct {
 /* What the frames on the bus ask for. */
 typedef struct {
     bool operational;
-    bool prepared;       /* shutdown has come since the drive was last disabled, */
-    bool enabled;        /* and enable operation behind it */
-    bool unsure;         /* random frames may have changed what frames mean */
-    uint64_t enabled_ns; /* the last time */
+    bool prepared;         /* shutdown has come since the drive was last disabled, */
+    bool enabled;          /* and enable operation behind it */
+    bool unsure;           /* random frames may have changed what frames mean */
+    uint64_t enabled_ns;   /* the last time */
     uint64_t withdrawn_ns; /* enabled until then; 0: never yet */
     master_stop_t stop;
-    uint64_t stop_ns;    /* since when */
-    uint64_t sign_ns;    /* last sign of the master that is watched */
-    unsigned mode;       /* in the last frame */
-    bool aimed;          /* a set-point or target has come */
-    double target_rev;   /* the last one, over relative ones */
+    uint64_t stop_ns;  /* since when */
+    uint64_t sign_ns;  /* last sign of the master that is watched */
+    unsigned mode;     /* in the last frame */
+    bool aimed;        /* a set-point or target has come */
+    double target_rev; /* the last one, over relative ones */
     uint64_t target_ns;
     unsigned targets;
-    uint16_t word;       /* last controlword */
+    uint16_t word; /* last controlword */
 } master_wish_t;
 
 typedef struct {
     /* Before the drive runs. */
-    unsigned written; /* entries of the setting */
+    unsigned written;    /* entries of the setting */
     uint64_t started_us; /* 0: not yet */
     uint64_t idle_us;    /* nothing before, after a command of the NMT */
     uint64_t due_us;
     /* In it. */
-    unsigned taken;      /* targets of profile position that the drive has acknowledged */
-    bool ordered;        /* bit 4 is set */
+    unsigned taken;                /* targets of profile position that the drive has acknowledged */
+    bool ordered;                  /* bit 4 is set */
     double place_rev, speed_rev_s; /* cyclic position: of the target sent */
-    bool follows;        /* it has begun */
+    bool follows;                  /* it has begun */
     uint64_t guard_us, heartbeat_us;
-    uint64_t drawn;      /* random numbers */
+    uint64_t drawn; /* random numbers */
     master_drive_t drive;
     master_wish_t wish;
 } master_t;

@@ -9,7 +9,11 @@ enum { NMT_START = 1, NMT_STOP = 2, NMT_PRE_OPERATIONAL = 128, NMT_RESET_NODE = 
 #define PLACED_BYTES 6
 
 static unsigned decode(unsigned word) {
-    return !(word & 2u) ? DISABLE_VOLTAGE : !(word & 4u) ? QUICK_STOP : !(word & 1u) ? SHUTDOWN : !(word & 8u) ? DISABLE_OPERATION : ENABLE;
+    return !(word & 2u)   ? DISABLE_VOLTAGE
+           : !(word & 4u) ? QUICK_STOP
+           : !(word & 1u) ? SHUTDOWN
+           : !(word & 8u) ? DISABLE_OPERATION
+                          : ENABLE;
 }
 
 static void withdraw(master_wish_t *wish, uint64_t time_ns) {

@@ -104,7 +104,7 @@ typedef struct {
     const world_t *world;
     const plant_t *plant;
     const master_t *master; /* of a world with one */
-    uint64_t time_ns; /* of the event */
+    uint64_t time_ns;       /* of the event */
     uint64_t period_ns;
     uint32_t limit_bits, constant_bits; /* of the drive's memory: a change of a higher one has no effect */
     double largest_flux_Wb;             /* aligned, at the trip current */

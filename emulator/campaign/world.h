@@ -70,7 +70,7 @@ typedef struct {
     world_watch_t watch;
     unsigned watch_ms; /* without a sign of the master, which is lost then */
     unsigned quick_stop_option, abort_option, halt_option;
-    double speed_rpm;         /* of profiles, and of the velocity modes */
+    double speed_rpm;          /* of profiles, and of the velocity modes */
     double acceleration_rpm_s; /* of all ramps */
     double torque;             /* of the torque modes, of the rated one */
     bool limited;              /* the positions, to: */

@@ -10,10 +10,10 @@
 #define CANOPEN_SHARE 0.75
 #define ONE_QUADRANT_SHARE 0.1 /* with a controller that has no modes of position */
 #define LOADED_SHARE 0.4
-#define FAULTY_SHARE 0.15      /* with faults of the bench */
-#define LIMITED_SHARE 0.4      /* with limits of the position */
-#define CHANGING_SHARE 0.35    /* of the masters: another mode in the run */
-#define CONTROLLING_SHARE 0.4  /* a controlword of the stops, or of halt */
+#define FAULTY_SHARE 0.15     /* with faults of the bench */
+#define LIMITED_SHARE 0.4     /* with limits of the position */
+#define CHANGING_SHARE 0.35   /* of the masters: another mode in the run */
+#define CONTROLLING_SHARE 0.4 /* a controlword of the stops, or of halt */
 #define NMT_SHARE 0.12
 #define LOST_SHARE 0.25
 #define NOISE_SHARE 0.1
@@ -23,9 +23,9 @@
 #define HOSTILE_SHARE 0.1 /* of the clients of drive.dbc */
 
 #define TARGETS_MAX 5
-#define FIRST_US 120000 /* by then a client has started the drive */
+#define FIRST_US 120000  /* by then a client has started the drive */
 #define AFTER_US 1300000 /* a ramp and the second after which a lost master's run ends */
-#define LOAD_MAX 0.4    /* of the rated torque */
+#define LOAD_MAX 0.4     /* of the rated torque */
 
 static double unit(const world_t *world, unsigned index) {
     return seeded_unit(world->seed, STREAM_MOTION, index);
@@ -57,10 +57,11 @@ static void draw_targets(world_t *world, uint64_t last_us) {
                                   seeded_below(seed, STREAM_MOTION_TARGET, 80 + i, (unsigned)(last_us / targets));
         world_event_t *event = world_add(world, WORLD_TARGET, begin_us, 0);
         at_rev += draw_way_rev(world, i);
-        const bool relative = world->client == WORLD_CLIENT_CANOPEN &&
-                              seeded_unit(seed, STREAM_MOTION_TARGET, 20 + i) < RELATIVE_SHARE;
-        event->what = (seeded_unit(seed, STREAM_MOTION_TARGET, 40 + i) < IMMEDIATE_SHARE ? WORLD_TARGET_IMMEDIATELY : 0) |
-                      (relative ? WORLD_TARGET_RELATIVE : 0);
+        const bool relative =
+            world->client == WORLD_CLIENT_CANOPEN && seeded_unit(seed, STREAM_MOTION_TARGET, 20 + i) < RELATIVE_SHARE;
+        event->what =
+            (seeded_unit(seed, STREAM_MOTION_TARGET, 40 + i) < IMMEDIATE_SHARE ? WORLD_TARGET_IMMEDIATELY : 0) |
+            (relative ? WORLD_TARGET_RELATIVE : 0);
         event->value = relative ? draw_way_rev(world, i) : at_rev;
     }
 }
@@ -92,8 +93,8 @@ static void draw_setting(world_t *world) {
     master->quick_stop_option = quick_stops[seeded_below(seed, STREAM_MOTION, 34, 7)];
     master->abort_option = aborts[seeded_below(seed, STREAM_MOTION, 35, 4)];
     master->halt_option = 1 + seeded_below(seed, STREAM_MOTION, 36, 2);
-    master->speed_rpm = fmax(1.0, floor(world->machine->speed_base_rpm *
-                                        seeded_logarithmic(seed, STREAM_MOTION, 37, 0.05, 0.9)));
+    master->speed_rpm =
+        fmax(1.0, floor(world->machine->speed_base_rpm * seeded_logarithmic(seed, STREAM_MOTION, 37, 0.05, 0.9)));
     master->acceleration_rpm_s =
         fmin(1e6, fmax(1.0, floor(acceleration_max(world) * seeded_logarithmic(seed, STREAM_MOTION, 38, 0.1, 0.8))));
     master->torque = seeded_between(seed, STREAM_MOTION, 39, -0.3, 0.3);
@@ -126,7 +127,8 @@ static void draw_masters_events(world_t *world, uint64_t last_us) {
     if (unit(world, 55) < LOST_SHARE) {
         const uint64_t begin_us = time_us(world, 60, last_us);
         const uint64_t for_us = (uint64_t)seeded_logarithmic(seed, STREAM_MOTION_EVENT, 61, 2e3, 1e6);
-        world_add(world, WORLD_LOST, begin_us, seeded_unit(seed, STREAM_MOTION_EVENT, 62) < 0.6 ? 0 : begin_us + for_us);
+        world_add(world, WORLD_LOST, begin_us,
+                  seeded_unit(seed, STREAM_MOTION_EVENT, 62) < 0.6 ? 0 : begin_us + for_us);
     }
     if (unit(world, 56) < NOISE_SHARE) {
         world_add(world, WORLD_NOISE, time_us(world, 70, last_us), 0);

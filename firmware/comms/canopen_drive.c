@@ -111,7 +111,9 @@ static command_code_t decode(uint32_t word) {
 }
 
 COLD bool canopen_drive_is_stop(const canopen_t *canopen, uint32_t word) {
-    return canopen_enabled(canopen) && decode(word) != ENABLE;
+    const command_code_t code = decode(word);
+    return (word & FAULT_RESET) == 0 &&
+           (canopen_enabled(canopen) ? code != ENABLE : code == DISABLE_VOLTAGE || code == QUICK_STOP);
 }
 
 static void reset_fault(canopen_t *canopen, const canopen_context_t *context) {

@@ -30,7 +30,7 @@
 /* The controlword has been written. */
 void canopen_drive_control(canopen_t *canopen, const canopen_context_t *context);
 
-/* A controlword by which an enabled drive stops, or opens its switches. */
+/* A controlword by which an enabled drive stops or opens its switches, and one that is ready to is not any more. */
 bool canopen_drive_is_stop(const canopen_t *canopen, uint32_t word);
 
 /* Error codes of a lost master: by heartbeat, guarding or silence, by bus-off, by the event timer of a receive PDO. */

@@ -23,8 +23,8 @@ static void on_millisecond(const observation_t *seen, void *memory, checker_repo
     const master_wish_t *wish = &seen->master->wish;
     const double position_rev = facts_position_rev(seen);
     const bool inside = position_rev > setting->lowest_rev && position_rev < setting->highest_rev;
-    const bool asked = seen->drive.state == STATE_RUN && wish->enabled && wish->stop == MASTER_GOES_ON &&
-                       is_position(wish->mode);
+    const bool asked =
+        seen->drive.state == STATE_RUN && wish->enabled && wish->stop == MASTER_GOES_ON && is_position(wish->mode);
     if (!setting->limited || !asked || !facts_untouched(seen) || facts_chooses_mode(seen, MODE_HM) ||
         facts_has_event(seen, WORLD_LOST) || facts_has_event(seen, WORLD_NMT)) {
         state->within = false;

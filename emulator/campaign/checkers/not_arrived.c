@@ -1,6 +1,6 @@
 /* A move that nothing disturbs ends at its target: after four times the way at half of the speed and a quarter of the
- * acceleration, and 0.5 s, the rotor is within three counts of the encoder and the window of the position, of the target
- * or of the end stop before it. */
+ * acceleration, and 0.5 s, the rotor is within three counts of the encoder and the window of the position, of the
+ * target or of the end stop before it. */
 #include "campaign/checkers/checker.h"
 
 #include <math.h>
@@ -27,8 +27,8 @@ static bool wanted(const observation_t *seen, double *target_rev) {
         return seen->client.meant.position && seen->client.meant.request == SENDER_RUN && facts_heard(seen) &&
                facts_had_event(seen, WORLD_TARGET) && !facts_had_event(seen, WORLD_SILENT);
     }
-    *target_rev = setting->limited ? fmin(fmax(wish->target_rev, setting->lowest_rev), setting->highest_rev)
-                                   : wish->target_rev;
+    *target_rev =
+        setting->limited ? fmin(fmax(wish->target_rev, setting->lowest_rev), setting->highest_rev) : wish->target_rev;
     return wish->enabled && wish->stop == MASTER_GOES_ON && setting->mode == MODE_PP && wish->aimed &&
            (wish->word & 0x100u) == 0 && !facts_has_event(seen, WORLD_MODE) && !facts_has_event(seen, WORLD_CONTROL) &&
            !facts_has_event(seen, WORLD_LOST) && !facts_has_event(seen, WORLD_NMT);
@@ -41,7 +41,8 @@ static double needed_s(const observation_t *seen, double way_rev) {
     const double most = 0.25 * seen->world->machine->torque_max_Nm / inertia / TWO_PI;
     const double rate = canopen ? fmin(most, 0.5 * seen->world->master.acceleration_rpm_s / 60.0) : most;
     const double base_rev_s = facts_base_rad_s(seen) / TWO_PI;
-    const double speed = canopen ? fmin(0.5 * base_rev_s, 0.5 * seen->world->master.speed_rpm / 60.0) : 0.5 * base_rev_s;
+    const double speed =
+        canopen ? fmin(0.5 * base_rev_s, 0.5 * seen->world->master.speed_rpm / 60.0) : 0.5 * base_rev_s;
     return AFTER_S + fabs(way_rev) / speed + 2.0 * speed / rate;
 }
 

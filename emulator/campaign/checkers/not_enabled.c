@@ -2,8 +2,9 @@
  * NMT, and not after they have been withdrawn. */
 #include "campaign/checkers/checker.h"
 
-#define WITHDRAWN_NS (6 * MS_NS) /* until a frame has opened the gates: a cycle of the telemetry, and of the interrupts */
-#define SYNC_NS (11 * MS_NS)     /* a frame that waits for the next SYNC */
+#define WITHDRAWN_NS                                                                                                   \
+    (6 * MS_NS)              /* until a frame has opened the gates: a cycle of the telemetry, and of the interrupts */
+#define SYNC_NS (11 * MS_NS) /* a frame that waits for the next SYNC */
 
 static void on_look(const observation_t *seen, void *memory, checker_report_t *report) {
     (void)memory;

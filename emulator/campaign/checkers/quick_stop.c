@@ -6,16 +6,16 @@
 
 enum { FASTER = 1, NOT_OPEN, NOT_AT_REST };
 
-#define LATE_NS (8 * MS_NS)      /* cycles of telemetry and interrupts */
-#define REST_NS (1000 * MS_NS)   /* from the end of the ramp on the drive waits so long for its rotor */
-#define FASTER_BASE 0.05         /* of the base speed */
-#define SLOW 0.1                 /* of it: at rest */
+#define LATE_NS (8 * MS_NS)    /* cycles of telemetry and interrupts */
+#define REST_NS (1000 * MS_NS) /* from the end of the ramp on the drive waits so long for its rotor */
+#define FASTER_BASE 0.05       /* of the base speed */
+#define SLOW 0.1               /* of it: at rest */
 #define LOADED_NS (100 * MS_NS)
 
 typedef struct {
     uint64_t since_ns; /* 0: no reason to stop */
     double speed_rad_s;
-    bool known;        /* the speed when the stop began */
+    bool known; /* the speed when the stop began */
 } state_t;
 
 /* Silence of the master that the drive has to notice. */
@@ -28,9 +28,9 @@ static uint64_t lost_ns(const observation_t *seen) {
     const uint64_t end_ns = seen->master->wish.sign_ns + watch_ms * MS_NS;
     bool lost = false;
     for (unsigned i = 0; i < seen->world->events; i++) {
-        lost = lost || (seen->world->event[i].kind == WORLD_LOST &&
-                        world_active(seen->world, i, seen->time_ns / 1000) &&
-                        world_active(seen->world, i, seen->master->wish.sign_ns / 1000 + 12000));
+        lost =
+            lost || (seen->world->event[i].kind == WORLD_LOST && world_active(seen->world, i, seen->time_ns / 1000) &&
+                     world_active(seen->world, i, seen->master->wish.sign_ns / 1000 + 12000));
     }
     return lost && seen->time_ns > end_ns + LATE_NS ? end_ns : 0;
 }
@@ -63,7 +63,7 @@ static void on_look(const observation_t *seen, void *memory, checker_report_t *r
         state->since_ns = 0;
         return;
     }
-    const master_stop_t how = lost == 0                                 ? wish->stop
+    const master_stop_t how = lost == 0                               ? wish->stop
                               : seen->world->master.abort_option == 2 ? MASTER_OPENS
                                                                       : MASTER_STOPS;
     const uint64_t since_ns = lost != 0 ? lost : wish->stop_ns;

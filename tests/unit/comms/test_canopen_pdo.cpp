@@ -195,6 +195,13 @@ TEST_F(CanopenPdo, a_stop_is_taken_beside_a_value_that_is_refused) {
         receive(0x300 + NODE, {0x06, 0, 0x7F});
         EXPECT_EQ(read(0x6040, 0), 0u) << "nothing but a stop";
     }
+    control(6);
+    receive(0x300 + NODE, {0x02, 0, 0x7F});
+    control(15);
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "what was prepared is withdrawn";
+    canopen.drive.state = CANOPEN_FAULT;
+    receive(0x300 + NODE, {0x80, 0, 0x7F});
+    EXPECT_NE(read(0x6040, 0), 0x80u) << "no reset";
 }
 
 TEST_F(CanopenPdo, a_controlword_finds_the_references_of_its_sync) {
