@@ -344,3 +344,25 @@ def test_a_mistake_is_one_line_that_names_it(arguments: tuple[str, ...], message
 def test_a_folder_without_a_failure_is_named(tmp_path: Path) -> None:
     done = salient("replay", tmp_path)
     assert done.returncode == 2 and f"{tmp_path}/failure.json: not the note of a failure" in done.stderr
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize(("seed", "client"), [
+    (552, "canopen"),   # disable voltage beside a mode that the drive has not
+    (625, "canopen"),   # a stop before the rotor has reached its demand
+    (2393, "canopen"),  # what was prepared is withdrawn beside such a mode
+    (4, "position")])  # fmt: skip
+def test_worlds_of_positions_have_the_same_bits_on_the_usual_bench(seed: int, client: str) -> None:
+    drawn = world(seed, kind="motion")
+    assert drawn["client"] == client
+    again = replay(seed, kind="motion")
+    assert again.equal and again.campaign["violations"] == []
+
+
+@pytest.mark.in_turns
+def test_worlds_of_positions_differ_in_client_mode_and_events() -> None:
+    worlds = [world(seed, kind="motion") for seed in range(1, 81)]
+    assert {drawn["client"] for drawn in worlds} == {"position", "canopen"}
+    assert {drawn["master"]["mode"] for drawn in worlds if drawn["client"] == "canopen"} == {1, 3, 4, 6, 8, 9, 10}
+    events = {event["event"] for drawn in worlds for event in drawn["events"]}
+    assert {"position_rev", "mode", "controlword", "nmt", "lost_master", "canopen_noise", "second_master"} <= events
