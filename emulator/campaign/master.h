@@ -2,7 +2,7 @@
  * and references in receive PDOs each cycle, by the statusword that it hears, as a PLC does. Beside it, while the world
  * has them, a second master and a node that sends random frames of every service.
  *
- * What all of them ask for is followed by their frames on the bus, as a device of CiA 402 may at most take it. Shares
+ * All that they ask for is followed by their frames on the bus, as a device of CiA 402 may at most take it. Shares
  * no code with the firmware. */
 #ifndef CAMPAIGN_MASTER_H
 #define CAMPAIGN_MASTER_H
@@ -40,7 +40,7 @@ typedef struct {
     uint64_t placed_ns, status_ns;
 } master_drive_t;
 
-/* What the frames on the bus ask for. */
+/* Requests by the frames on the bus. */
 typedef struct {
     bool operational;
     bool prepared;         /* shutdown has come since the drive was last disabled, */

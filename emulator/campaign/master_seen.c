@@ -141,6 +141,11 @@ static bool is_sign(const sender_t *sender, const struct can_frame *frame) {
     }
 }
 
+/* An expedited write of the controlword. */
+static bool is_controlword(const struct can_frame *frame) {
+    return frame->len == 8 && frame->data[1] == 0x40 && frame->data[2] == 0x60 && frame->data[0] >> 5 == 1;
+}
+
 void master_on_bus(sender_t *sender, uint64_t time_ns, const struct can_frame *frame) {
     master_wish_t *wish = &sender->master.wish;
     if (frame->can_id & CAN_EFF_FLAG) {
@@ -154,8 +159,7 @@ void master_on_bus(sender_t *sender, uint64_t time_ns, const struct can_frame *f
         take_nmt(sender, time_ns, frame);
     } else if (own && base >= 0x200 && base <= 0x500 && (base & 0x80u) == 0 && frame->len >= 2) {
         take_pdo(sender, time_ns, frame);
-    } else if (own && base == 0x600 && frame->len == 8 && frame->data[1] == 0x40 && frame->data[2] == 0x60 &&
-               frame->data[0] >> 5 == 1) {
+    } else if (own && base == 0x600 && is_controlword(frame)) {
         take_word(sender, time_ns, frame->data[4] | (unsigned)frame->data[5] << 8);
     }
 }

@@ -62,7 +62,7 @@ enum { WORLD_TARGET_IMMEDIATELY = 1, WORLD_TARGET_RELATIVE = 2 };
 /* How a CANopen master is watched. */
 typedef enum { WORLD_WATCH_SILENCE, WORLD_WATCH_HEARTBEAT, WORLD_WATCH_GUARDING, WORLD_WATCH_PDO } world_watch_t;
 
-/* What a CANopen master writes before it starts the drive. */
+/* Setting that a CANopen master writes before it starts the drive. */
 typedef struct {
     unsigned mode;     /* of CiA 402, first */
     unsigned cycle_ms; /* of its frames */

@@ -142,7 +142,7 @@ static void draw_masters_events(world_t *world, uint64_t last_us) {
     }
 }
 
-/* Of a client of drive.dbc. */
+/* Silence, requests and hostile frames of a client of drive.dbc. */
 static void draw_clients_events(world_t *world, uint64_t last_us) {
     if (unit(world, 55) < LOST_SHARE) {
         const uint64_t begin_us = time_us(world, 60, last_us);

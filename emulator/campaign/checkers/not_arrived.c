@@ -5,6 +5,7 @@
 
 #include <math.h>
 
+#define HALT 0x100u /* of the controlword */
 #define COUNTS 3.0
 #define WINDOW_REV (0.05 / 360.0)
 #define AFTER_S 0.5
@@ -15,23 +16,32 @@ typedef struct {
     double target_rev, begin_rev;
 } state_t;
 
+static bool moves_by_dbc(const observation_t *seen) {
+    return seen->client.meant.position && seen->client.meant.request == SENDER_RUN && facts_heard(seen) &&
+           facts_had_event(seen, WORLD_TARGET) && !facts_had_event(seen, WORLD_SILENT);
+}
+
+/* By profile position alone. */
+static bool moves_by_canopen(const observation_t *seen) {
+    const master_wish_t *wish = &seen->master->wish;
+    return wish->enabled && wish->stop == MASTER_GOES_ON && seen->world->master.mode == MODE_PP && wish->aimed &&
+           (wish->word & HALT) == 0 && !facts_has_event(seen, WORLD_MODE) && !facts_has_event(seen, WORLD_CONTROL) &&
+           !facts_has_event(seen, WORLD_LOST) && !facts_has_event(seen, WORLD_NMT);
+}
+
 /* Target of the move under way; false: none that is judged. */
 static bool wanted(const observation_t *seen, double *target_rev) {
-    const master_wish_t *wish = &seen->master->wish;
     const world_master_t *setting = &seen->world->master;
+    const double aim_rev = seen->master->wish.target_rev;
     if (seen->drive.state != STATE_RUN || !facts_untouched(seen) || !facts_four_quadrants(seen)) {
         return false;
     }
     if (seen->world->client == WORLD_CLIENT_POSITION) {
         *target_rev = seen->client.meant.reference;
-        return seen->client.meant.position && seen->client.meant.request == SENDER_RUN && facts_heard(seen) &&
-               facts_had_event(seen, WORLD_TARGET) && !facts_had_event(seen, WORLD_SILENT);
+        return moves_by_dbc(seen);
     }
-    *target_rev =
-        setting->limited ? fmin(fmax(wish->target_rev, setting->lowest_rev), setting->highest_rev) : wish->target_rev;
-    return wish->enabled && wish->stop == MASTER_GOES_ON && setting->mode == MODE_PP && wish->aimed &&
-           (wish->word & 0x100u) == 0 && !facts_has_event(seen, WORLD_MODE) && !facts_has_event(seen, WORLD_CONTROL) &&
-           !facts_has_event(seen, WORLD_LOST) && !facts_has_event(seen, WORLD_NMT);
+    *target_rev = setting->limited ? fmin(fmax(aim_rev, setting->lowest_rev), setting->highest_rev) : aim_rev;
+    return moves_by_canopen(seen);
 }
 
 /* Time for a way with a part of the speed and of the acceleration. */

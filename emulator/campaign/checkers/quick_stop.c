@@ -10,7 +10,6 @@ enum { FASTER = 1, NOT_OPEN, NOT_AT_REST };
 #define REST_NS (1000 * MS_NS) /* from the end of the ramp on the drive waits so long for its rotor */
 #define FASTER_BASE 0.05       /* of the base speed */
 #define SLOW 0.1               /* of it: at rest */
-#define LOADED_NS (100 * MS_NS)
 
 typedef struct {
     uint64_t since_ns; /* 0: no reason to stop */
@@ -35,18 +34,40 @@ static uint64_t lost_ns(const observation_t *seen) {
     return lost && seen->time_ns > end_ns + LATE_NS ? end_ns : 0;
 }
 
-static void judge(const observation_t *seen, state_t *state, checker_report_t *report, master_stop_t how) {
+/* The master asks for the stop, or is lost. */
+typedef struct {
+    master_stop_t how; /* MASTER_GOES_ON: not */
+    uint64_t since_ns;
+    bool lost;
+} reason_t;
+
+static reason_t reason_of(const observation_t *seen) {
+    const master_wish_t *wish = &seen->master->wish;
+    const uint64_t lost = lost_ns(seen);
+    if (!wish->enabled || !facts_untouched(seen) || seen->drive.state == STATE_FAULT || !facts_four_quadrants(seen)) {
+        return (reason_t){.how = MASTER_GOES_ON};
+    }
+    if (lost != 0) {
+        return (reason_t){seen->world->master.abort_option == 2 ? MASTER_OPENS : MASTER_STOPS, lost, true};
+    }
+    return (reason_t){wish->stop, wish->stop_ns, false};
+}
+
+static void judge(const observation_t *seen, const state_t *state, checker_report_t *report, master_stop_t how) {
     const double base_rad_s = facts_base_rad_s(seen), speed_rad_s = fabs(seen->plant->speed_rad_s);
     const double ramp_s = state->speed_rad_s * RPM_PER_RAD_S / seen->world->master.acceleration_rpm_s;
     const uint64_t until_ns = state->since_ns + LATE_NS + (uint64_t)(1.2e9 * ramp_s) + REST_NS + LATE_NS;
-    const uint64_t load_ns = facts_load_ns(seen);
-    const bool loaded = load_ns != 0 && (seen->world->events == 0 || load_ns + LOADED_NS > state->since_ns ||
-                                         facts_has_event(seen, WORLD_SET));
-    if (how != MASTER_OPENS && !loaded && speed_rad_s > state->speed_rad_s + FASTER_BASE * base_rad_s) {
+    const bool loaded = facts_load_ns(seen) != 0;
+    if (how == MASTER_OPENS) {
+        if (seen->gates && seen->time_ns > state->since_ns + 2 * LATE_NS) {
+            checker_violated(report, NOT_OPEN, (double)(seen->time_ns - state->since_ns) * 1e-6);
+        }
+        return;
+    }
+    if (!loaded && speed_rad_s > state->speed_rad_s + FASTER_BASE * base_rad_s) {
         checker_violated(report, FASTER, speed_rad_s - state->speed_rad_s);
     }
-    if (how == MASTER_OPENS ? seen->gates && seen->time_ns > state->since_ns + 2 * LATE_NS
-                            : how == MASTER_STOPS && seen->gates && seen->time_ns > until_ns) {
+    if (how == MASTER_STOPS && seen->gates && seen->time_ns > until_ns) {
         checker_violated(report, NOT_OPEN, (double)(seen->time_ns - state->since_ns) * 1e-6);
     }
     if (how == MASTER_HOLDS && seen->time_ns > until_ns && speed_rad_s > SLOW * base_rad_s && !loaded) {
@@ -56,26 +77,20 @@ static void judge(const observation_t *seen, state_t *state, checker_report_t *r
 
 static void on_look(const observation_t *seen, void *memory, checker_report_t *report) {
     state_t *state = memory;
-    const master_wish_t *wish = &seen->master->wish;
-    const uint64_t lost = lost_ns(seen);
-    const bool asked = wish->enabled && (wish->stop != MASTER_GOES_ON || lost != 0);
-    if (!asked || !facts_untouched(seen) || seen->drive.state == STATE_FAULT || !facts_four_quadrants(seen)) {
+    const reason_t reason = reason_of(seen);
+    if (reason.how == MASTER_GOES_ON) {
         state->since_ns = 0;
         return;
     }
-    const master_stop_t how = lost == 0                               ? wish->stop
-                              : seen->world->master.abort_option == 2 ? MASTER_OPENS
-                                                                      : MASTER_STOPS;
-    const uint64_t since_ns = lost != 0 ? lost : wish->stop_ns;
-    if (state->since_ns == 0 || (lost != 0 && state->since_ns < lost)) {
-        *state = (state_t){.since_ns = since_ns};
+    if (state->since_ns == 0 || (reason.lost && state->since_ns < reason.since_ns)) {
+        *state = (state_t){.since_ns = reason.since_ns};
     }
     if (!state->known && seen->time_ns > state->since_ns + LATE_NS) {
         state->known = true;
         state->speed_rad_s = fmax(fabs(seen->plant->speed_rad_s), seen->recent.speed_rad_s);
     }
     if (state->known) {
-        judge(seen, state, report, how);
+        judge(seen, state, report, reason.how);
     }
 }
 
