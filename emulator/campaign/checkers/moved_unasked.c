@@ -12,12 +12,18 @@ typedef struct {
     double position_rev;
 } state_t;
 
-static bool holds(const observation_t *seen) {
+/* A cyclic master whose drive is enabled while it turns leads it back to where it was then. */
+static bool holds_by_canopen(const observation_t *seen) {
     const master_wish_t *wish = &seen->master->wish;
+    const bool led = wish->mode == MODE_CSP && facts_has_event(seen, WORLD_CONTROL);
+    return wish->enabled && wish->stop == MASTER_GOES_ON && !facts_has_event(seen, WORLD_MODE) && !led &&
+           (wish->mode == MODE_PP || wish->mode == MODE_CSP || wish->mode == MODE_HM);
+}
+
+static bool holds(const observation_t *seen) {
     const bool position = seen->world->client == WORLD_CLIENT_POSITION
                               ? seen->client.meant.position && seen->client.meant.request == SENDER_RUN
-                              : wish->enabled && wish->stop == MASTER_GOES_ON && !facts_has_event(seen, WORLD_MODE) &&
-                                    (wish->mode == MODE_PP || wish->mode == MODE_CSP || wish->mode == MODE_HM);
+                              : holds_by_canopen(seen);
     return position && seen->drive.state == STATE_RUN && facts_four_quadrants(seen) && facts_untouched(seen) &&
            !facts_had_event(seen, WORLD_TARGET) && !facts_had_event(seen, WORLD_SILENT) &&
            !facts_had_event(seen, WORLD_LOST) && !facts_had_event(seen, WORLD_NMT);
