@@ -167,7 +167,7 @@ bool facts_can_turn(const observation_t *seen) {
 
 bool facts_runs_by_speed(const observation_t *seen) {
     return seen->drive.state == STATE_RUN && seen->client.meant.request == SENDER_RUN && !seen->client.meant.torque &&
-           facts_can_turn(seen);
+           !seen->client.meant.position && facts_can_turn(seen);
 }
 
 /* After bus-off, which disturbed frames lead to as well, a request to run has no effect until it has been withdrawn, or
@@ -267,4 +267,57 @@ double facts_uncounted_rad_s(const observation_t *seen) {
     const world_t *world = seen->world;
     const double count_rad = ldexp(TWO_PI, -(int)world->encoder_bits);
     return sqrt(2.0 * world->machine->torque_max_Nm / facts_inertia_kg_m2(seen) * count_rad);
+}
+
+/* --- Positions --- */
+
+bool facts_untouched(const observation_t *seen) {
+    return seen->ever_disturbed == 0 && !seen->second_sender && !seen->hostile_sender && !seen->master->wish.unsure &&
+           seen->reset_ns == 0 && !facts_had_event(seen, WORLD_MASTER);
+}
+
+double facts_position_rev(const observation_t *seen) {
+    return seen->plant->rotor_angle_rad / TWO_PI + seen->encoder_offset_rev - seen->start_rev;
+}
+
+double facts_count_rev(const observation_t *seen) {
+    return ldexp(1.0, -(int)seen->world->encoder_bits);
+}
+
+static bool has_event(const observation_t *seen, world_kind_t kind, uint64_t by_us) {
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, by_us);
+        if (event != NULL && event->kind == kind) {
+            return true;
+        }
+    }
+    return false;
+}
+
+bool facts_has_event(const observation_t *seen, world_kind_t kind) {
+    return has_event(seen, kind, UINT64_MAX);
+}
+
+bool facts_had_event(const observation_t *seen, world_kind_t kind) {
+    return has_event(seen, kind, seen->time_ns / 1000);
+}
+
+uint64_t facts_load_ns(const observation_t *seen) {
+    uint64_t latest_us = 0;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, seen->time_ns / 1000);
+        if (event != NULL && facts_is_load(event)) {
+            latest_us = event->begin_us > latest_us ? event->begin_us : latest_us;
+        }
+    }
+    return latest_us * 1000;
+}
+
+bool facts_chooses_mode(const observation_t *seen, unsigned mode) {
+    bool chooses = seen->world->master.mode == mode;
+    for (unsigned i = 0; i < seen->world->events; i++) {
+        const world_event_t *event = world_begun(seen->world, i, UINT64_MAX);
+        chooses = chooses || (event != NULL && event->kind == WORLD_MODE && event->what == mode);
+    }
+    return seen->world->client == WORLD_CLIENT_CANOPEN && chooses;
 }

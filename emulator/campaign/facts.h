@@ -88,6 +88,27 @@ bool facts_pushed(const observation_t *seen);
 /* A frame may wait in the drive for its background, at most for the watchdog's 18 ms: this time later. */
 uint64_t facts_request_max_ns(const observation_t *seen, uint64_t max_ns);
 
+/* --- Positions --- */
+
+/* Neither a fault of the bench, nor another sender, nor a reset, at any time. */
+bool facts_untouched(const observation_t *seen);
+
+/* True position as the drive counts it without a homing, revolutions. */
+double facts_position_rev(const observation_t *seen);
+
+/* A count of the encoder, revolutions. */
+double facts_count_rev(const observation_t *seen);
+
+/* The world has, or has had by now, an event of the kind. */
+bool facts_has_event(const observation_t *seen, world_kind_t kind);
+bool facts_had_event(const observation_t *seen, world_kind_t kind);
+
+/* The load last changed, ns; 0: not yet. */
+uint64_t facts_load_ns(const observation_t *seen);
+
+/* The master chooses, or has chosen by the end of the world, a mode of CiA 402; none but modes of a list. */
+bool facts_chooses_mode(const observation_t *seen, unsigned mode);
+
 /* --- Quantities --- */
 
 /* Rotation from a phase to the next one. */

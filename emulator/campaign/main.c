@@ -1,6 +1,6 @@
 /* Worlds by seed: runs a range of seeds, each in a process of its own, and prints a JSON line for each.
  *
- *   salient_campaign --machines FILE [--first SEED] [--seeds N] [--step N] [--healthy] [--keep MASK]
+ *   salient_campaign --machines FILE [--first SEED] [--seeds N] [--step N] [--healthy|--motion] [--keep MASK]
  *                    [--frames FILE] [--describe] [--serve] [--branch CONTROLLER SPEED_RPM LOAD_NM FIRST TICKS EVERY]
  *                    [--flips CONTROLLER STATE FIRST COUNT STEP]
  *
@@ -41,7 +41,8 @@ machine_tables_t machine_tables;
 static bool start(const world_t *of, board_t *board, rig_firmware_t *firmware) {
     const drive_config_t config = {.control_rate_hz = of->control_rate_hz,
                                    .controller = (drive_controller_t)of->controller,
-                                   .telemetry_period_ms = 4};
+                                   .telemetry_period_ms = 4,
+                                   .canopen_node = of->client == WORLD_CLIENT_CANOPEN ? MASTER_NODE : 0};
     return machine_image_tables(&of->machine->image, &machine_tables_structure, &machine_tables) &&
            host_drive_start(&host, board, &config, firmware);
 }
@@ -133,14 +134,16 @@ static void print_result(void) {
 typedef struct {
     const char *machines_file, *frames_file;
     uint64_t first, seeds, step, keep;
-    bool healthy, describe, serve;
+    bool healthy, motion, describe, serve;
     branch_setting_t branch;
     flips_setting_t flip;
     bool branches, flips;
 } arguments_t;
 
 static int run_seed(const arguments_t *arguments, uint64_t seed) {
-    (arguments->healthy ? world_draw_healthy : world_draw)(&world, machines, machine_count, seed);
+    (arguments->motion    ? world_draw_motion
+     : arguments->healthy ? world_draw_healthy
+                          : world_draw)(&world, machines, machine_count, seed);
     world.kept = arguments->keep;
     if (arguments->describe) {
         world_print(&world);
@@ -210,8 +213,10 @@ static bool parse_flag(arguments_t *arguments, const char *option) {
     const struct {
         const char *name;
         bool *to;
-    } flags[] = {
-        {"--healthy", &arguments->healthy}, {"--describe", &arguments->describe}, {"--serve", &arguments->serve}};
+    } flags[] = {{"--healthy", &arguments->healthy},
+                 {"--motion", &arguments->motion},
+                 {"--describe", &arguments->describe},
+                 {"--serve", &arguments->serve}};
     for (unsigned i = 0; i < sizeof flags / sizeof *flags; i++) {
         if (strcmp(option, flags[i].name) == 0) {
             return *flags[i].to = true;

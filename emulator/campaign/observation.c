@@ -116,6 +116,7 @@ void observation_start(observation_t *seen, const world_t *world, const plant_t 
     magnetics_evaluate(&plant->magnetics, 0.0, world->machine->trip_current_A, &aligned);
     seen->largest_flux_Wb = aligned.flux_linkage_Wb;
     seen->encoder_offset_rev = encoder_offset_rev(world);
+    seen->start_rev = floor(plant->rotor_angle_rad / TWO_PI + seen->encoder_offset_rev);
     seen->limit.limited = limited(world);
     look_at_events(seen);
 }
@@ -377,6 +378,9 @@ static void see_set(observation_t *seen, const uint8_t data[8]) {
 void observation_on_frame(observation_t *seen, uint64_t time_ns, unsigned identifier, const uint8_t data[8]) {
     observation_limit_t *limit = &seen->limit;
     seen->time_ns = time_ns;
+    if (seen->world->client == WORLD_CLIENT_CANOPEN) {
+        return;
+    }
     if (identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID) {
         see_set(seen, data);
     }

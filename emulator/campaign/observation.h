@@ -103,11 +103,13 @@ typedef struct {
 typedef struct {
     const world_t *world;
     const plant_t *plant;
-    uint64_t time_ns; /* of the event */
+    const master_t *master; /* of a world with one */
+    uint64_t time_ns;       /* of the event */
     uint64_t period_ns;
     uint32_t limit_bits, constant_bits; /* of the drive's memory: a change of a higher one has no effect */
     double largest_flux_Wb;             /* aligned, at the trip current */
     double encoder_offset_rev;          /* on the shaft, in the direction of counting */
+    double start_rev;                   /* turns of the encoder at the start: positions of the drive begin in them */
 
     observation_drive_t drive;
     uint8_t before;         /* state before the present control interrupt */

@@ -74,6 +74,7 @@ bool run_begin(run_t *run, const world_t *world, const run_drive_t *drive, FILE 
         !checkers_start(&run->checkers, world, &run->rig.plant, 1000000000u / world->control_rate_hz)) {
         return false;
     }
+    run->checkers.seen.master = &run->sender.master;
     run->checkers.seen.limit_bits = drive->limit_bits;
     run->checkers.seen.constant_bits = drive->constant_bits;
     run->rig.observer = (rig_observer_t){before_interrupt, after_interrupt, after_restart, run};

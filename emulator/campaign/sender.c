@@ -183,8 +183,21 @@ static void take_references(sender_t *sender) {
     }
 }
 
+/* In position mode the drive holds until the first target. */
+static void command_position(sender_t *sender, const transport_receiver_t *receiver, sender_request_t request) {
+    const world_event_t *target = master_event(sender, WORLD_TARGET, false);
+    sender->request = request;
+    sender->due_us = sender->time_us + SENDER_COMMAND_PERIOD_US;
+    sender_put_position(sender, receiver, sender->counter++, request, target != NULL,
+                        target != NULL ? target->value : 0.0);
+}
+
 static void command(sender_t *sender, const transport_receiver_t *receiver, sender_request_t request) {
     const world_t *world = sender->world;
+    if (world->client == WORLD_CLIENT_POSITION) {
+        command_position(sender, receiver, request);
+        return;
+    }
     const world_event_t *torque = active(sender, WORLD_TORQUE), *beyond = active(sender, WORLD_BEYOND);
     const int32_t reference = beyond   ? reference_beyond(world, beyond->value)
                               : torque ? (int32_t)floor(torque->value / world->machine->command_lsb_Nm + 0.5)
@@ -243,8 +256,12 @@ static size_t descriptors(transport_t *transport, struct pollfd *list) {
 static size_t read_clients(transport_t *transport, const transport_receiver_t *receiver) {
     sender_t *sender = (sender_t *)transport;
     sender_put_events(sender, receiver);
-    step_honest(sender, receiver);
-    sender_step_rival(sender, receiver);
+    if (sender->world->client == WORLD_CLIENT_CANOPEN) {
+        master_step(sender, receiver);
+    } else {
+        step_honest(sender, receiver);
+        sender_step_rival(sender, receiver);
+    }
     uint8_t run[7];
     const uint64_t until_ns = (sender->time_us + SENDER_STEP_US) * 1000;
     memcpy(run, &until_ns, 6);
@@ -259,7 +276,20 @@ static bool is_same(const sender_frame_t *frame, const struct can_frame *on_bus)
            memcmp(frame->data, on_bus->data, frame->length) == 0;
 }
 
+static sender_meaning_t meaning_of_position(const sender_frame_t *frame) {
+    struct drive_position_command_t command;
+    drive_position_command_unpack(&command, frame->data, frame->length);
+    return (sender_meaning_t){.genuine = frame->in_sequence,
+                              .command = true,
+                              .position = true,
+                              .request = (sender_request_t)command.request,
+                              .reference = command.position_deg / SENDER_POSITIONS_PER_REV};
+}
+
 static sender_meaning_t meaning_of_genuine(const sender_t *sender, const sender_frame_t *frame) {
+    if (frame->identifier == DRIVE_POSITION_COMMAND_FRAME_ID) {
+        return meaning_of_position(frame);
+    }
     const bool torque = frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
     const world_machine_t *machine = sender->world->machine;
     const uint32_t raw = frame->data[4] | (uint32_t)frame->data[5] << 8 | (uint32_t)frame->data[6] << 16;
@@ -293,6 +323,11 @@ static sender_meaning_t meaning_of(sender_t *sender, const struct can_frame *on_
 
 /* A frame of the drive; all that concern the client have eight bytes. */
 static void listen(sender_t *sender, const struct can_frame *frame, uint64_t time_ns) {
+    if (sender->world->client == WORLD_CLIENT_CANOPEN) {
+        master_on_frame(sender, time_ns, frame);
+        sender->on_frame(sender->context, time_ns, frame->can_id, frame->data);
+        return;
+    }
     if (frame->len != 8) {
         return;
     }
@@ -331,7 +366,9 @@ static void send_clients(transport_t *transport, uint64_t time_ns, transport_ori
     mix(sender, &frame->classic.can_id, sizeof frame->classic.can_id);
     mix(sender, &frame->classic.len, 1);
     mix(sender, frame->classic.data, frame->classic.len);
-    if (origin == TRANSPORT_FROM_CLIENT_ON_BUS) {
+    if (origin == TRANSPORT_FROM_CLIENT_ON_BUS && sender->world->client == WORLD_CLIENT_CANOPEN) {
+        master_on_bus(sender, time_ns, &frame->classic);
+    } else if (origin == TRANSPORT_FROM_CLIENT_ON_BUS) {
         const sender_meaning_t meaning = meaning_of(sender, &frame->classic, time_ns);
         sender->on_command(sender->context, time_ns, &meaning);
     } else if (origin == TRANSPORT_FROM_EMULATOR) {

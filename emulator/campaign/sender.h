@@ -10,11 +10,13 @@
 #include <stdint.h>
 #include <stdio.h>
 
+#include "campaign/master.h"
 #include "campaign/world.h"
 #include "rig/transport.h"
 
 #define SENDER_STEP_US UINT64_C(1000)
 #define SENDER_HISTORY 64
+#define SENDER_POSITIONS_PER_REV 0x1p18 /* of position_deg in drive.dbc */
 
 typedef enum { SENDER_OFF, SENDER_RUN, SENDER_STOP, SENDER_CLEAR } sender_request_t;
 
@@ -35,8 +37,9 @@ typedef struct {
     bool command;  /* a motion command */
     bool confirms; /* an arming confirmed */
     bool torque;   /* the command is one of the torque mode */
+    bool position; /* or of the position mode */
     sender_request_t request;
-    double reference; /* r/min or, in torque mode, N m */
+    double reference; /* r/min; in torque mode N m, in position mode revolutions */
 } sender_meaning_t;
 
 /* Indices of what the client sets. */
@@ -64,6 +67,7 @@ typedef struct sender {
     sender_request_t request;
     int32_t reference; /* LSBs */
     int32_t recovery_reference;
+    master_t master; /* of CANopen, in place of the honest client */
     /* Second client. */
     uint8_t second_counter;
     uint64_t second_due_us;

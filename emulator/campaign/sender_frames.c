@@ -1,6 +1,7 @@
 #include "campaign/sender_frames.h"
 
 #include <inttypes.h>
+#include <math.h>
 #include <string.h>
 
 #include "campaign/drive_numbers.h"
@@ -48,7 +49,8 @@ void sender_put(sender_t *sender, const transport_receiver_t *receiver, unsigned
 }
 
 bool sender_is_motion_command(unsigned identifier) {
-    return identifier == DRIVE_COMMAND_FRAME_ID || identifier == DRIVE_TORQUE_COMMAND_FRAME_ID;
+    return identifier == DRIVE_COMMAND_FRAME_ID || identifier == DRIVE_TORQUE_COMMAND_FRAME_ID ||
+           identifier == DRIVE_POSITION_COMMAND_FRAME_ID;
 }
 
 void sender_put_genuine(sender_t *sender, const transport_receiver_t *receiver, unsigned client, unsigned identifier,
@@ -76,6 +78,19 @@ void sender_put_command(sender_t *sender, const transport_receiver_t *receiver, 
                    counter);
     sender_put_genuine(sender, receiver, client, torque_mode ? DRIVE_TORQUE_COMMAND_FRAME_ID : DRIVE_COMMAND_FRAME_ID,
                        data, sizeof data);
+}
+
+void sender_put_position(sender_t *sender, const transport_receiver_t *receiver, uint8_t counter,
+                         sender_request_t request, bool moves, double position_rev) {
+    const struct drive_position_command_t command = {
+        .request = (uint8_t)request,
+        .order = moves ? DRIVE_POSITION_COMMAND_ORDER_PROFILE_CHOICE : DRIVE_POSITION_COMMAND_ORDER_HALT_CHOICE,
+        .position_deg = (int32_t)floor(position_rev * SENDER_POSITIONS_PER_REV + 0.5),
+    };
+    uint8_t data[DRIVE_POSITION_COMMAND_LENGTH];
+    drive_position_command_pack(data, &command, sizeof data);
+    sender_protect(data, sizeof data, DRIVE_POSITION_COMMAND_E2E_DATA_ID, counter);
+    sender_put_genuine(sender, receiver, SENDER_HONEST, DRIVE_POSITION_COMMAND_FRAME_ID, data, sizeof data);
 }
 
 void sender_put_arm(sender_t *sender, const transport_receiver_t *receiver, unsigned step, uint32_t response) {

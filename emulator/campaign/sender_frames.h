@@ -21,6 +21,8 @@ void sender_put_genuine(sender_t *sender, const transport_receiver_t *receiver, 
 /* reference: LSBs of the speed or, in torque mode, of the torque. */
 void sender_put_command(sender_t *sender, const transport_receiver_t *receiver, unsigned client, uint8_t counter,
                         bool torque_mode, sender_request_t request, int32_t reference);
+void sender_put_position(sender_t *sender, const transport_receiver_t *receiver, uint8_t counter,
+                         sender_request_t request, bool moves, double position_rev);
 void sender_put_arm(sender_t *sender, const transport_receiver_t *receiver, unsigned step, uint32_t response);
 
 /* One byte and four: PARAMETER_WRITE, PARAMETER_SET_CONTROL. */

@@ -73,20 +73,49 @@ const char *world_event_name(const world_event_t *event) {
         [WORLD_DEGRADED] = "degraded_running",
         [WORLD_LIMITED] = "limited_torque",
         [WORLD_ARMED] = "armed",
+        [WORLD_TARGET] = "position_rev",
+        [WORLD_MODE] = "mode",
+        [WORLD_CONTROL] = "controlword",
+        [WORLD_NMT] = "nmt",
+        [WORLD_LOST] = "lost_master",
+        [WORLD_NOISE] = "canopen_noise",
+        [WORLD_MASTER] = "second_master",
     };
     return event->kind == WORLD_SET     ? bench_variables[event->what].name
            : event->kind == WORLD_FAULT ? fault_kinds[event->what].name
                                         : names[event->kind];
 }
 
+static bool has_number(world_kind_t kind) {
+    return kind == WORLD_HOSTILE || kind == WORLD_REQUEST || kind == WORLD_DEGRADED || kind == WORLD_MODE ||
+           kind == WORLD_CONTROL || kind == WORLD_NMT || kind == WORLD_MASTER;
+}
+
+static void print_master(const world_master_t *master) {
+    static const char *const watches[] = {"silence", "heartbeat", "guarding", "pdo"};
+    printf("\"master\": {\"mode\": %u, \"cycle_ms\": %u, \"synchronous\": %s, \"watch\": \"%s\", \"watch_ms\": %u, "
+           "\"quick_stop_option\": %u, \"abort_option\": %u, \"halt_option\": %u, \"speed_rpm\": %.9g, "
+           "\"acceleration_rpm_s\": %.9g, \"torque\": %.9g, \"limited\": %s, \"lowest_rev\": %.9g, "
+           "\"highest_rev\": %.9g}, ",
+           master->mode, master->cycle_ms, master->synchronous ? "true" : "false", watches[master->watch],
+           master->watch_ms, master->quick_stop_option, master->abort_option, master->halt_option, master->speed_rpm,
+           master->acceleration_rpm_s, master->torque, master->limited ? "true" : "false", master->lowest_rev,
+           master->highest_rev);
+}
+
 void world_print(const world_t *world) {
     static const char *const controllers[] = {"traditional", "paper", "salient"};
+    static const char *const clients[] = {"speed", "position", "canopen"};
     printf("{\"seed\": %" PRIu64 ", \"machine\": \"%s\", \"controller\": \"%s\", \"control_rate_hz\": %u, "
            "\"encoder_bits\": %u, \"adc_bits\": %u, \"encoder_edges\": %s, \"initial_angle_deg\": %.17g, "
-           "\"keeps_reference\": %s, \"duration_us\": %" PRIu64 ", \"recovery_us\": %" PRIu64 ", \"events\": [",
+           "\"keeps_reference\": %s, \"duration_us\": %" PRIu64 ", \"recovery_us\": %" PRIu64 ", \"client\": \"%s\", ",
            world->seed, world->machine->name, controllers[world->controller], world->control_rate_hz,
            world->encoder_bits, world->adc_bits, world->encoder_edges ? "true" : "false", world->initial_angle_deg,
-           world->keeps_reference ? "true" : "false", world->duration_us, world->recovery_us);
+           world->keeps_reference ? "true" : "false", world->duration_us, world->recovery_us, clients[world->client]);
+    if (world->client == WORLD_CLIENT_CANOPEN) {
+        print_master(&world->master);
+    }
+    printf("\"events\": [");
     const char *separator = "";
     for (unsigned i = 0; i < world->events; i++) {
         const world_event_t *event = world_begun(world, i, UINT64_MAX);
@@ -98,7 +127,7 @@ void world_print(const world_t *world) {
             value = event->raw * bench_variables[event->what].scale;
         } else if (event->kind == WORLD_FAULT) {
             value = event->raw * fault_kinds[event->what].scale;
-        } else if (event->kind == WORLD_HOSTILE || event->kind == WORLD_REQUEST || event->kind == WORLD_DEGRADED) {
+        } else if (has_number(event->kind)) {
             value = event->what;
         }
         printf("%s{\"index\": %u, \"event\": \"%s\", \"begin_us\": %" PRIu64 ", \"end_us\": %" PRIu64

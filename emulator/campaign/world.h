@@ -41,7 +41,41 @@ typedef enum {
     WORLD_DEGRADED, /* the client sets the parameter degraded_running before it runs the drive; what: a check */
     WORLD_LIMITED,  /* before that it sets torque_max_Nm to `value` of the largest torque; what 1: and saves it */
     WORLD_ARMED,    /* the client arms the drive also while it does not request to run, from begin to end */
+    WORLD_TARGET,   /* the position is `value` revolutions from begin on; what: WORLD_TARGET_* of profile position */
+    WORLD_MODE,     /* the master chooses mode `what` of CiA 402 from begin on */
+    WORLD_CONTROL,  /* its controlword is `what` from begin to end */
+    WORLD_NMT,      /* it sends the NMT command `what` at begin */
+    WORLD_LOST,     /* it is not heard from begin to end */
+    WORLD_NOISE,    /* a second client sends random frames of every service to the drive, from begin to end */
+    WORLD_MASTER,   /* a second master sends controlword `what` from begin to end */
 } world_kind_t;
+
+/* Clients of a world. */
+typedef enum {
+    WORLD_CLIENT_SPEED,    /* commands of speed and torque by drive.dbc */
+    WORLD_CLIENT_POSITION, /* commands of position by drive.dbc */
+    WORLD_CLIENT_CANOPEN,  /* a master of CANopen */
+} world_client_t;
+
+enum { WORLD_TARGET_IMMEDIATELY = 1, WORLD_TARGET_RELATIVE = 2 };
+
+/* How a CANopen master is watched. */
+typedef enum { WORLD_WATCH_SILENCE, WORLD_WATCH_HEARTBEAT, WORLD_WATCH_GUARDING, WORLD_WATCH_PDO } world_watch_t;
+
+/* Setting that a CANopen master writes before it starts the drive. */
+typedef struct {
+    unsigned mode;     /* of CiA 402, first */
+    unsigned cycle_ms; /* of its frames */
+    bool synchronous;  /* with SYNC */
+    world_watch_t watch;
+    unsigned watch_ms; /* without a sign of the master, which is lost then */
+    unsigned quick_stop_option, abort_option, halt_option;
+    double speed_rpm;          /* of profiles, and of the velocity modes */
+    double acceleration_rpm_s; /* of all ramps */
+    double torque;             /* of the torque modes, of the rated one */
+    bool limited;              /* the positions, to: */
+    double lowest_rev, highest_rev;
+} world_master_t;
 
 typedef enum {
     WORLD_HOSTILE_NOISE,    /* random data with identifiers of commands */
@@ -82,6 +116,8 @@ typedef struct {
     unsigned events;
     world_event_t event[WORLD_EVENTS_MAX];
     uint64_t kept; /* bit n: event n happens */
+    world_client_t client;
+    world_master_t master;
 } world_t;
 
 /* A world without events and faults, whose drive has the usual board: 40 kHz, sensors of 12 and 17 bits. */

@@ -47,8 +47,7 @@ static void add_speed(world_t *world, double rpm, uint64_t begin_us) {
     }
 }
 
-/* Machine, board, sensors: what both kinds of worlds have. */
-static void draw_board(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
+void world_draw_board(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
     static const unsigned rates_hz[] = {20000, 40000, 40000, 50000};
     *world = (world_t){.seed = seed, .kept = UINT64_MAX};
     world->machine = &machines[seeded_below(seed, STREAM_BOARD, 0, count)];
@@ -70,7 +69,7 @@ static void draw_board(world_t *world, const world_machine_t *machines, unsigned
 }
 
 /* As built machines and boards scatter; the ranges of the robustness study, the encoder apart. */
-static void draw_imperfections(world_t *world) {
+void world_draw_imperfections(world_t *world) {
     const uint64_t seed = world->seed;
     const machine_t *machine = &world->machine->image.machine;
     const double range_A = machine->ranges.current_A;
@@ -244,9 +243,9 @@ static void draw_request(world_t *world, uint64_t last_us) {
 }
 
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
-    draw_board(world, machines, count, seed);
+    world_draw_board(world, machines, count, seed);
     world->keeps_reference = seeded_unit(seed, STREAM_REQUEST, 17) < KEEPING_SHARE;
-    draw_imperfections(world);
+    world_draw_imperfections(world);
     const double first_rpm = draw_speed_rpm(world, 0);
     uint64_t last_us = (uint64_t)(1e6 * fmin(0.1 + 1.5 * start_s(world, 0.0, first_rpm),
                                              seeded_between(seed, STREAM_SCRIPT, 9, 0.1, 0.4)));
@@ -278,9 +277,9 @@ void world_draw(world_t *world, const world_machine_t *machines, unsigned count,
 }
 
 void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed) {
-    draw_board(world, machines, count, seed);
+    world_draw_board(world, machines, count, seed);
     world->healthy = true;
-    draw_imperfections(world);
+    world_draw_imperfections(world);
     double rpm = 0.0, at_s = 0.0;
     const unsigned changes = 1 + seeded_below(seed, STREAM_SPEED, 80, 3);
     for (unsigned i = 0; i < changes; i++) {

@@ -6,8 +6,13 @@
 
 #include "campaign/world.h"
 
-/* With faults; a healthy one. */
+/* Machine, board and sensors, and how they scatter: parts of every kind. */
+void world_draw_board(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
+void world_draw_imperfections(world_t *world);
+
+/* With faults; a healthy one; one of positions or with a CANopen master (world_motion.c). */
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
+void world_draw_motion(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 
 #endif

@@ -14,6 +14,9 @@ enum {
     STREAM_GATES,
     STREAM_TORQUE,
     STREAM_REQUEST,
+    STREAM_MOTION, /* of worlds of positions alone */
+    STREAM_MOTION_TARGET,
+    STREAM_MOTION_EVENT,
 };
 
 #define DEGRADED_SHARE 0.1 /* of the seeds */

@@ -7,10 +7,12 @@
 #include "comms/canopen_sdo.h"
 #include "comms/canopen_send.h"
 #include "fixed/compiler.h"
+#include "fixed/fixed.h"
 
 #define NMT_ID 0x000u
 #define HEARTBEAT_ID 0x700u
 #define US_PER_MS 1000u
+#define GUARD_MAX_MS 2000000u /* half an hour: a time of 32 bits is not longer in us */
 #define TOGGLE 0x80u
 #define NODE_SHIFT 16
 enum { NMT_START = 1, NMT_STOP = 2, NMT_PRE_OPERATIONAL = 128, NMT_RESET_NODE = 129, NMT_RESET_COMMUNICATION = 130 };
@@ -189,8 +191,9 @@ static void watch_silence(canopen_t *canopen, const canopen_context_t *context, 
 }
 
 static void watch_master(canopen_t *canopen, const canopen_context_t *context) {
-    const uint32_t guard_us = (uint32_t)canopen->values[CANOPEN_VALUE_GUARD_TIME] * US_PER_MS *
-                              (uint32_t)canopen->values[CANOPEN_VALUE_LIFE_FACTOR];
+    const uint32_t guard_ms = (uint32_t)canopen->values[CANOPEN_VALUE_GUARD_TIME] *
+                              (uint32_t)canopen->values[CANOPEN_VALUE_LIFE_FACTOR]; /* below 2^24 */
+    const uint32_t guard_us = fixed_min_u32(guard_ms, GUARD_MAX_MS) * US_PER_MS;
     bool watched = canopen->guard.watched && guard_us != 0;
     watch(canopen, context, &canopen->guard, guard_us);
     for (unsigned i = 0; i < CANOPEN_CONSUMERS; i++) {

@@ -82,9 +82,12 @@ COLD void canopen_demand_begin(canopen_t *canopen) {
 
 COLD void canopen_demand_stop(canopen_t *canopen) {
     canopen_drive_t *drive = &canopen->drive;
-    if (drive->torque || drive->position) {
+    const int64_t present = q16(present_speed(canopen));
+    const bool ahead = present > 0 ? drive->demand_q16 > present || drive->demand_q16 < 0
+                                   : drive->demand_q16 < present || drive->demand_q16 > 0;
+    if (drive->torque || drive->position || ahead) { /* a demand ahead of the rotor would go on to accelerate it */
         drive->torque = drive->position = false;
-        drive->demand_q16 = q16(present_speed(canopen));
+        drive->demand_q16 = present;
     }
     drive->at_rest = false;
 }

@@ -110,6 +110,12 @@ static command_code_t decode(uint32_t word) {
     return (word & ENABLE_OPERATION) == 0 ? DISABLE_OPERATION : ENABLE;
 }
 
+COLD bool canopen_drive_is_stop(const canopen_t *canopen, uint32_t word) {
+    const command_code_t code = decode(word);
+    return (word & FAULT_RESET) == 0 &&
+           (canopen_enabled(canopen) ? code != ENABLE : code == DISABLE_VOLTAGE || code == QUICK_STOP);
+}
+
 static void reset_fault(canopen_t *canopen, const canopen_context_t *context) {
     canopen_drive_t *drive = &canopen->drive;
     if (canopen->measured.state == DRIVE_STATE_FAULT) {

@@ -30,6 +30,9 @@
 /* The controlword has been written. */
 void canopen_drive_control(canopen_t *canopen, const canopen_context_t *context);
 
+/* A controlword by which an enabled drive stops or opens its switches, and one that is ready to is not any more. */
+bool canopen_drive_is_stop(const canopen_t *canopen, uint32_t word);
+
 /* Error codes of a lost master: by heartbeat, guarding or silence, by bus-off, by the event timer of a receive PDO. */
 #define CANOPEN_MASTER_SILENT 0x8130u
 #define CANOPEN_BUS_OFF 0x8140u

@@ -196,9 +196,9 @@ static uint32_t check_choice(const canopen_t *canopen, const canopen_object_t *o
         allowed = value == PROFILE_TRAPEZOID || value == PROFILE_JERK_LIMITED;
         break;
     case CANOPEN_VALUE_POSITION_MIN:
-        return value < canopen->values[CANOPEN_VALUE_POSITION_MAX] ? CANOPEN_DONE : CANOPEN_INCOMPATIBLE;
+        return value < canopen->values[CANOPEN_VALUE_POSITION_MAX] ? CANOPEN_DONE : CANOPEN_OUT_OF_ORDER;
     case CANOPEN_VALUE_POSITION_MAX:
-        return value > canopen->values[CANOPEN_VALUE_POSITION_MIN] ? CANOPEN_DONE : CANOPEN_INCOMPATIBLE;
+        return value > canopen->values[CANOPEN_VALUE_POSITION_MIN] ? CANOPEN_DONE : CANOPEN_OUT_OF_ORDER;
     case CANOPEN_VALUE_POLARITY:
         allowed = (value & ~POLARITIES) == 0;
         break;
@@ -218,7 +218,7 @@ COLD uint32_t canopen_check(const canopen_t *canopen, const canopen_object_t *ob
         return CANOPEN_READ_ONLY;
     }
     const uint32_t limits = check_limits(object, value);
-    if (limits != CANOPEN_DONE) {
+    if (limits != CANOPEN_DONE || (object->row.access & CANOPEN_CONSTANT) != 0) { /* a constant is what it is */
         return limits;
     }
     return (object->row.access & CANOPEN_FROM) != 0 ? check_signature(object, value)
@@ -296,7 +296,8 @@ COLD uint32_t canopen_write(canopen_t *canopen, const canopen_context_t *context
                             int32_t value) {
     const unsigned slot = canopen_slot(object);
     if (slot >= CANOPEN_VALUE_COUNT) {
-        return write_from(canopen, context, object, value);
+        const bool constant = (object->row.access & CANOPEN_CONSTANT) != 0;
+        return constant ? CANOPEN_DONE : write_from(canopen, context, object, value);
     }
     canopen->values[slot] = value;
     if (slot == CANOPEN_VALUE_CONTROLWORD) {

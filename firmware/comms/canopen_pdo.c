@@ -20,7 +20,7 @@ static unsigned mapped_count(const canopen_t *canopen, unsigned value, unsigned 
     return fixed_min_u32((uint32_t)canopen->values[value + pdo], CANOPEN_MAPPED_MAX);
 }
 
-typedef enum { CHECK, WRITE, CONTROL } pass_t;
+typedef enum { CHECK, WRITE, CONTROL, STOP } pass_t;
 
 /* Handles a value of a receive PDO in one of the passes; false: it cannot be written. */
 static bool take_value(canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object,
@@ -32,7 +32,7 @@ static bool take_value(canopen_t *canopen, const canopen_context_t *context, con
     if (pass == CHECK) {
         return canopen_check(canopen, object, value) == CANOPEN_DONE;
     }
-    if (control == (pass == CONTROL)) {
+    if (pass == STOP ? control && canopen_drive_is_stop(canopen, (uint32_t)value) : control == (pass == CONTROL)) {
         canopen_write(canopen, context, object, value);
     }
     return true;
@@ -57,17 +57,18 @@ static bool pass_over(canopen_t *canopen, const canopen_context_t *context, unsi
 }
 
 /* Checks all values of the frames of some PDOs, a bit each, and writes them, the controlwords last: a controlword finds
- * mode and references of its frame, and of its SYNC. */
+ * mode and references of its frame, and of its SYNC. A value that is refused takes no other with it that stops. */
 static void take(canopen_t *canopen, const canopen_context_t *context, unsigned pdos) {
+    unsigned refused = 0;
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         if ((pdos >> pdo & 1u) != 0 &&
             (!pass_over(canopen, context, pdo, CHECK) || !pass_over(canopen, context, pdo, WRITE))) {
-            pdos &= ~(1u << pdo);
+            refused |= 1u << pdo;
         }
     }
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         if ((pdos >> pdo & 1u) != 0) {
-            pass_over(canopen, context, pdo, CONTROL);
+            pass_over(canopen, context, pdo, (refused >> pdo & 1u) != 0 ? STOP : CONTROL);
         }
     }
 }

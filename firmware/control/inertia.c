@@ -253,13 +253,11 @@ static void follow_rest(inertia_t *inertia) {
     inertia->refined_shift = inertia->shift;
 }
 
-/* The rest belongs to the present shift. */
-static void move_rest(inertia_t *inertia) {
-    const int32_t change = fixed_clamp(inertia->shift - inertia->refined_shift, -1, 1);
+/* The rest of the present shift, which has changed. */
+static void move_rest(inertia_t *inertia, int32_t change) {
     const int32_t rest_q14 = limited_rest(inertia->rest_q14), inverse_q14 = limited_rest(inertia->inverse_rest_q14);
     inertia->rest_q14 = limited_rest(scaled(rest_q14, change));
     inertia->inverse_rest_q14 = limited_rest(scaled(inverse_q14, -change));
-    inertia->refined_shift = inertia->shift;
 }
 
 static bool is_straight(const inertia_parameters_t *parameters, const inertia_t *inertia) {
@@ -276,14 +274,14 @@ COLD NOINLINE void inertia_refine(const inertia_parameters_t *parameters, const 
         return;
     }
     limit_shift(inertia);
+    const int32_t change = fixed_clamp(inertia->shift - inertia->refined_shift, -1, 1);
+    inertia->refined_windows = windows;
+    inertia->refined_shift = inertia->shift;
     if (!parameters->fine) {
-        inertia->refined_windows = windows;
-        inertia->refined_shift = inertia->shift;
         inertia->ratio_q14 = scaled(REST_ONE, inertia->shift);
         return;
     }
-    move_rest(inertia);
-    inertia->refined_windows = windows;
+    move_rest(inertia, change);
     if (inertia->transient_windows > 0 && windows > START_WINDOWS + REGRESSION_WINDOWS &&
         is_straight(parameters, inertia)) {
         follow_rest(inertia);

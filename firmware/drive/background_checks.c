@@ -13,12 +13,22 @@
  * call, because currents may repeat after a few periods. */
 #define CHECKS_PER_MS 10u
 
-COLD static void read_stall_input(const control_state_t *control, stall_input_t *input) {
+/* The rotor is held at its place: within two counts, or the window, of a reference that rests. Between the counts of a
+ * coarse encoder the speed reference of that error stays, though nothing is to turn. */
+COLD static bool holds_position(const control_state_t *control, const control_parameters_t *parameters) {
+    const position_status_t *place = &control->position.status;
+    const int64_t counts = 4 * (int64_t)parameters->encoder_middle, window = parameters->position.window >> 16;
+    const int64_t most = counts > window ? counts : window;
+    return place->active && place->speed_reference_q22 == 0 && place->error <= most && place->error >= -most;
+}
+
+COLD static void read_stall_input(const control_state_t *control, const control_parameters_t *parameters,
+                                  stall_input_t *input) {
     const deferred_speed_results_t *speed = &deferred_in_effect(control)->speed;
     *input = (stall_input_t){
         .speed_mode = control->state_machine.state == DRIVE_STATE_RUN && control->deferred.mode == DRIVE_MODE_SPEED &&
                       !position_seeks_stop(&control->position) && !control->state_machine.identifies,
-        .speed_reference_q22 = speed->speed_reference_q22,
+        .speed_reference_q22 = holds_position(control, parameters) ? 0 : speed->speed_reference_q22,
         .speed_q22 = control->observer.speed_q22,
         .torque_reference_q24 = control->torque_reference_q24,
         .torque_min_q24 = speed->torque_min_q24,
@@ -55,7 +65,7 @@ COLD static bool read_sample(const control_state_t *control, const control_param
             input->next_q29[phase] = control->applied_flux.next_q29[phase];
             input->off[phase] = control->duty_q15[phase] == -MODULATOR_DUTY_ONE_Q15;
         }
-        read_stall_input(control, &sample->stall);
+        read_stall_input(control, parameters, &sample->stall);
         if (unmasked_read_ended(request, input->periods)) {
             return true;
         }

@@ -216,6 +216,14 @@ static void drop_unarmed_command(drive_t *drive, hal_t *hal) {
     }
 }
 
+/* Torque that the load leaves with a sixteenth in reserve, of the largest one, Q14. */
+COLD static int16_t torque_left_q14(const drive_t *drive) {
+    const int32_t most_q24 = fixed_max(drive->control_parameters.conduction.torque_max_q24, 1);
+    const int32_t limit_q24 = fixed_min(drive->control.torque_limit_q24, most_q24);
+    const int64_t left_q24 = (int64_t)limit_q24 - limit_q24 / 16 - fixed_abs(drive->control.observer.load_torque_q24);
+    return (int16_t)fixed_clamp_64(fixed_divide(left_q24 * (1 << 14), most_q24), 0, INT16_MAX);
+}
+
 /* After bus-off a run request is without effect until the sender has withdrawn it: the present command ages until its
  * timeout, and a sender that simply continues does not start the drive again. [SR-38] */
 COLD static void take_command(drive_t *drive, hal_t *hal) {
@@ -227,8 +235,11 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
         const bool positions = command->mode == DRIVE_MODE_POSITION;
         position_command_t position;
         if (positions) {
+            if (drive->control.position.status.speed_reference_q22 == 0) { /* a move's inertia may look like a load */
+                drive->left_q14 = torque_left_q14(drive);
+            }
             position = position_command(&drive->control_parameters.position, &command->position,
-                                        drive->control.deferred.inertia.ratio_q14);
+                                        drive->control.deferred.inertia.ratio_q14, drive->left_q14);
             if (position.set_point.homing >= POSITION_HOMING_METHODS) {
                 position.set_point.homing = (position_homing_t)drive->parameters.values[PARAMETER_HOMING_METHOD];
             }

@@ -9,9 +9,9 @@ from salient.experiments.compare.every_machine import EXAMPLES
 
 
 def expect_no_fault(seed: int, machine: str, controller: str, rate_hz: int) -> None:
-    drawn = world(seed, healthy=True)
+    drawn = world(seed, kind="healthy")
     assert (drawn["machine"], drawn["controller"], drawn["control_rate_hz"]) == (machine, controller, rate_hz)
-    result = run_world(seed, healthy=True)
+    result = run_world(seed, kind="healthy")
     assert result["violations"] == [] and result["causes"] == []
     assert result["virtual_us"] == pytest.approx(drawn["duration_us"], abs=1000)
 

@@ -78,7 +78,7 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
     violations = [{"rule": "gate_on", "number": 1, "at_us": 5}, {"rule": "no_command", "number": 2, "at_us": 7}]
     saved = {}
 
-    def save(seed: int, violation: str, folder: Path, healthy: bool) -> dict[str, object]:
+    def save(seed: int, violation: str, folder: Path, kind: str) -> dict[str, object]:
         saved[folder.name] = violation
         return {"world": {"events": []}, "replay": f"tools/salient replay {folder}"}
 
@@ -94,7 +94,7 @@ def test_a_seed_that_breaks_two_rules_leaves_a_folder_of_each(tmp_path: Path, mo
 
 def test_a_worker_with_another_build_ends_the_campaign() -> None:
     with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
-        serve((1, False, "digest of another build"))
+        serve((1, "faults", "digest of another build"))
 
 
 def test_the_programs_are_the_same_bytes_wherever_the_clone_is() -> None:
@@ -134,7 +134,7 @@ def test_a_seed_has_the_same_bits_on_the_usual_bench(tmp_path: Path, seed: int) 
 @pytest.mark.in_turns
 @pytest.mark.parametrize("seed", [13, 19, 39, 87, 1584])
 def test_warm_windings_of_small_machines_are_no_false_alarm(seed: int) -> None:
-    result = run_world(seed, healthy=True)
+    result = run_world(seed, kind="healthy")
     assert result["violations"] == [] and result["causes"] == []
     assert 300_000 < result["virtual_us"] < 4_000_000
 
@@ -344,3 +344,26 @@ def test_a_mistake_is_one_line_that_names_it(arguments: tuple[str, ...], message
 def test_a_folder_without_a_failure_is_named(tmp_path: Path) -> None:
     done = salient("replay", tmp_path)
     assert done.returncode == 2 and f"{tmp_path}/failure.json: not the note of a failure" in done.stderr
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize(("seed", "client"), [
+    (552, "canopen"),   # disable voltage beside a mode that the drive has not
+    (625, "canopen"),   # a stop before the rotor has reached its demand
+    (2393, "canopen"),  # what was prepared is withdrawn beside such a mode
+    (3218, "position"),  # a rotor that is held between coarse counts is not stalled
+    (8, "position")])  # fmt: skip
+def test_worlds_of_positions_have_the_same_bits_on_the_usual_bench(seed: int, client: str) -> None:
+    drawn = world(seed, kind="motion")
+    assert drawn["client"] == client
+    again = replay(seed, kind="motion")
+    assert again.equal and again.campaign["violations"] == []
+
+
+@pytest.mark.in_turns
+def test_worlds_of_positions_differ_in_client_mode_and_events() -> None:
+    worlds = [world(seed, kind="motion") for seed in range(1, 81)]
+    assert {drawn["client"] for drawn in worlds} == {"position", "canopen"}
+    assert {drawn["master"]["mode"] for drawn in worlds if drawn["client"] == "canopen"} == {1, 3, 4, 6, 8, 9, 10}
+    events = {event["event"] for drawn in worlds for event in drawn["events"]}
+    assert {"position_rev", "mode", "controlword", "nmt", "lost_master", "canopen_noise", "second_master"} <= events

@@ -19,7 +19,7 @@ from salient.experiments.campaign.runner import run_world
 @pytest.mark.in_turns
 @pytest.mark.parametrize("entry", known.known(), ids=lambda entry: f"{entry.seed}-{entry.violation}")
 def test_a_known_deviation_is_still_there_and_has_a_reason(entry: Known) -> None:
-    found = classes(run_world(entry.seed, healthy=entry.healthy))
+    found = classes(run_world(entry.seed, kind=entry.kind))
     assert entry.violation in found, f"{entry.seed}: remove it from {known.FILE.name}"
     assert len(entry.reason) > 60
 
@@ -35,15 +35,15 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, entries: tuple[Known, .
 
 def test_a_listed_violation_is_counted_as_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
                                                 capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, tmp_path, (Known(3, False, "mute", "r"),)) == 0
+    assert run(monkeypatch, tmp_path, (Known(3, "faults", "mute", "r"),)) == 0
     note = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert note["violations"] == {} and note["known_deviations"] == {"mute": {"count": 1, "seeds": [3]}}
     assert "0 violations, 1 known deviations" in capsys.readouterr().out
     assert report._violations(note) == "0 violations, 1 known deviations"
 
 
-@pytest.mark.parametrize("entry", [Known(4, False, "mute", "r"), Known(3, True, "mute", "r"),
-                                   Known(3, False, "misled", "r")])
+@pytest.mark.parametrize("entry", [Known(4, "faults", "mute", "r"), Known(3, "healthy", "mute", "r"),
+                                   Known(3, "faults", "misled", "r")])
 def test_a_violation_of_another_world_or_rule_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
                                                     entry: Known) -> None:
     assert run(monkeypatch, tmp_path, (entry,)) == 1
@@ -51,14 +51,14 @@ def test_a_violation_of_another_world_or_rule_fails(monkeypatch: pytest.MonkeyPa
 
 def test_a_known_deviation_that_has_gone_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
                                                   capsys: pytest.CaptureFixture[str]) -> None:
-    run(monkeypatch, tmp_path, (Known(3, False, "mute", "r"), Known(3, False, "misled", "r")))
+    run(monkeypatch, tmp_path, (Known(3, "faults", "mute", "r"), Known(3, "faults", "misled", "r")))
     assert "no longer a deviation, to be removed from known.toml: seed 3 misled" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ('[[known]]\nseed = 1\nhealthy = false\nviolation = "mute"\n', "must have seed, healthy, violation, reason"),
-    ('[[known]]\nseed = "1"\nhealthy = false\nviolation = "mute"\nreason = ""\n', "must have"),
-    ('[[known]]\nseed = 1\nhealthy = false\nviolation = "mute"\nreason = ""\n' * 2, "twice"),
+    ('[[known]]\nseed = 1\nkind = "faults"\nviolation = "mute"\n', "must have seed, kind, violation, reason"),
+    ('[[known]]\nseed = "1"\nkind = "faults"\nviolation = "mute"\nreason = ""\n', "must have"),
+    ('[[known]]\nseed = 1\nkind = "faults"\nviolation = "mute"\nreason = ""\n' * 2, "twice"),
 ])  # fmt: skip
 def test_an_entry_that_is_not_complete_is_refused(text: str, message: str) -> None:
     with pytest.raises(RunFailed, match=message):

@@ -118,7 +118,7 @@ def test_the_campaign_finds_an_angle_that_is_a_count_off(tmp_path: Path) -> None
 
 
 def test_a_planted_bug_is_replayed_on_the_host_alone(tmp_path: Path) -> None:
-    note = {"seed": 4, "kept": "0x0", "healthy": False, "bug": CLEARED.name}
+    note = {"seed": 4, "kept": "0x0", "kind": "faults", "bug": CLEARED.name}
     (tmp_path / "failure.json").write_text(json.dumps(note), encoding="utf-8")
     done = salient("replay", tmp_path, "--target", "rv32")
     assert done.returncode == 2 and "--target rv32" in done.stderr and done.stderr.count("\n") == 1

@@ -162,7 +162,7 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 deferred_tune(&parameters, &state);
                 ASSERT_STREQ(difference(parameters, of_the_set), "") << "sequence " << sequence;
             }
-            state.position_command = position_command(&parameters.position, &bench.command.position, 1 << 14);
+            state.position_command = position_command(&parameters.position, &bench.command.position, 1 << 14, 1 << 14);
             const drive_state_t before = state.state_machine.state;
             hal_pwm_compare_t compare;
             const bool closed = control_step(&parameters, &state, &bench.sample, &bench.command, &compare);
@@ -221,7 +221,8 @@ TEST(Fuzz, garbage_from_every_sensor_at_once_is_survived) {
                                            .torque_reference_q24 = int32_t(uint32_t(random())),
                                            .time_us = uint32_t(random()),
                                            .position = any_set_point(random)};
-                state.position_command = position_command(&parameters.position, &command.position, 1 << 14);
+                state.position_command =
+                    position_command(&parameters.position, &command.position, 1 << 14, int32_t(random()));
                 hal_pwm_compare_t compare;
                 const bool closed = control_step(&parameters, &state, &sample, &command, &compare);
                 if (random() % 4 != 0) {

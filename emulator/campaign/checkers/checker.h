@@ -14,6 +14,9 @@ typedef struct {
     const uint8_t *data;
 } checker_frame_t;
 
+/* PDO of a world's drive with its position. */
+#define CHECKER_PLACED (0x280u + MASTER_NODE)
+
 typedef struct checker_report checker_report_t;
 
 /* The property is violated now: remembered once for each number, which distinguishes ways to violate it. */

@@ -42,6 +42,10 @@ typedef struct {
 } walk_t;
 
 static bool advance(walk_t *walk, checkers_t *checkers) {
+    const unsigned world = 1u << checkers->seen.world->client;
+    while (walk->next < checkers_count && !(checkers_table[walk->next].worlds & world)) {
+        walk->units += units_of(checkers_table[walk->next++].checker);
+    }
     if (walk->next == checkers_count) {
         return false;
     }

@@ -12,6 +12,10 @@
 /* Identified inertia by the parameter's, Q14: 9/8 and 8. */
 #define RATIO_LARGE_Q14 (9 << 11)
 #define RATIO_MAX_Q14 (8 << 14)
+#define RATIO_MIN_Q14 (1 << 11)
+
+/* Part of the largest torque that an acceleration uses, Q14. */
+#define USED_Q14 (3 << 12)
 
 #define REV (INT64_C(1) << PROFILE_FRACTION_BITS)
 
@@ -107,13 +111,20 @@ COLD static int64_t within(const position_parameters_t *parameters, int64_t posi
     return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->lowest, parameters->highest);
 }
 
-/* Acceleration by 3/4 of the largest torque, of an inertia that exceeds the parameter by more than an eighth. */
-COLD static int64_t acceleration_of_inertia(const position_parameters_t *parameters, int32_t ratio_q14) {
-    return ratio_q14 <= RATIO_LARGE_Q14 ? INT64_MAX : fixed_divide(parameters->acceleration_max, ratio_q14) << 14;
+/* Acceleration by 3/4 of the largest torque, of an inertia that exceeds the parameter by more than an eighth; by what
+ * is left of the torque, when that is less. */
+COLD static int64_t acceleration_left(const position_parameters_t *parameters, int32_t ratio_q14,
+                                      int32_t torque_left_q14) {
+    const int32_t left_q14 = fixed_clamp(torque_left_q14, USED_Q14 / 8, USED_Q14);
+    if (ratio_q14 <= RATIO_LARGE_Q14 && left_q14 == USED_Q14) {
+        return INT64_MAX;
+    }
+    const int64_t most = parameters->acceleration_max - parameters->acceleration_max / USED_Q14 * (USED_Q14 - left_q14);
+    return fixed_divide(most, fixed_max(ratio_q14, RATIO_MIN_Q14)) << 14;
 }
 
 COLD position_command_t position_command(const position_parameters_t *parameters, const position_set_point_t *set_point,
-                                         int32_t inertia_ratio_q14) {
+                                         int32_t inertia_ratio_q14, int32_t torque_left_q14) {
     position_command_t command = {
         .set_point = *set_point,
         .limits = parameters->limits,
@@ -126,7 +137,7 @@ COLD position_command_t position_command(const position_parameters_t *parameters
         command.lowest = within(parameters, set_point->lowest);
         command.highest = within(parameters, set_point->highest);
     }
-    const int64_t most_acceleration = acceleration_of_inertia(parameters, command.inertia_ratio_q14);
+    const int64_t most_acceleration = acceleration_left(parameters, command.inertia_ratio_q14, torque_left_q14);
     if (most_acceleration < INT64_MAX || set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 ||
         set_point->deceleration_rpm_s > 0 || set_point->jerk_rpm_s2 > 0) {
         const profile_limits_t *most = &parameters->limits;

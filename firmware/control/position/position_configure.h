@@ -31,8 +31,9 @@ typedef struct {
 /* [background] */
 position_parameters_t position_configure(const position_settings_t *settings);
 
-/* The set point with its limits, none beyond the parameters'. [background] */
+/* The set point with its limits, none beyond the parameters'. inertia_ratio_q14: identified inertia by the parameter's;
+ * torque_left_q14: torque that the load leaves, of the largest one, any value, limited to 3/32..3/4. [background] */
 position_command_t position_command(const position_parameters_t *parameters, const position_set_point_t *set_point,
-                                    int32_t inertia_ratio_q14);
+                                    int32_t inertia_ratio_q14, int32_t torque_left_q14);
 
 #endif

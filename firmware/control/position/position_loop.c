@@ -76,6 +76,15 @@ static void go_to(position_t *position, const position_command_t *command, int64
     position->stops = false;
 }
 
+/* End stops that have become narrower since the set point came shorten its move; they move no reference that rests. */
+static void keep_within(position_t *position, const position_command_t *command) {
+    const int64_t here = position->profile.end.x;
+    const int64_t low = command->lowest < here ? command->lowest : here;
+    const int64_t high = command->highest > here ? command->highest : here;
+    position->status.limited |= position->target < low || position->target > high;
+    position->target = fixed_clamp_64(position->target, low, high);
+}
+
 /* Calls the place `here` (counted, 2^-32 rev) by a name, and moves the reference with it. */
 COLD NOINLINE static void set_zero(position_t *position, int64_t here, int64_t name) {
     const int64_t zero = here - name;
@@ -282,8 +291,10 @@ COLD NOINLINE static void decide(position_t *position, const position_command_t 
         follow_targets(position, command, begins);
     } else if (set_point->order == POSITION_ORDER_HOME) {
         home(position, command, sample, begins);
-    } else {
+    } else if (begins || set_point->sequence != position->sequence) {
         go_to(position, command, to_profile(limited(set_point->target)));
+    } else {
+        keep_within(position, command);
     }
     if (set_point->order != POSITION_ORDER_CYCLIC || position->status.following_error) {
         position->cubic_ticks = 0;

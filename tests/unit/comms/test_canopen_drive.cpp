@@ -255,6 +255,25 @@ TEST_F(CanopenDrive, a_quick_stop_ends_at_rest_with_the_switches_open) {
     expect_state(CANOPEN_SWITCH_ON_DISABLED, "enable alone");
 }
 
+TEST_F(CanopenDrive, a_stop_begins_with_a_rotor_that_has_not_reached_its_demand) {
+    for (const unsigned word : {QUICK_STOP, SWITCH_ON}) {
+        for (const int32_t sign : {1, -1}) {
+            go(CANOPEN_OPERATION_ENABLED);
+            write(0x6083, 0, 1000000);
+            write(0x60FF, 0, sign * 3000);
+            values.motion.speed_rpm = sign * 100000;
+            cycle(10);
+            EXPECT_EQ(int32_t(read(0x606B, 0)), sign * 3000);
+            control(word);
+            cycle(2);
+            EXPECT_LE(std::abs(int32_t(read(0x606B, 0))), 100);
+            EXPECT_GE(std::abs(int32_t(read(0x606B, 0))), 80) << "by its ramp";
+            values.motion.speed_rpm = 0;
+            cycle(200);
+        }
+    }
+}
+
 TEST_F(CanopenDrive, a_load_that_turns_the_rotor_does_not_keep_a_stop_from_ending) {
     enable();
     control(QUICK_STOP);
@@ -391,6 +410,21 @@ TEST_F(CanopenDrive, a_consumer_without_node_or_time_is_none_and_a_node_is_watch
     receive(0x77F, {5});
     cycle(2100);
     EXPECT_NE(canopen.drive.state, CANOPEN_OPERATION_ENABLED) << "an entry that is not used replaces no supervision";
+}
+
+TEST_F(CanopenDrive, long_guard_times_are_not_short_ones) {
+    for (const auto &[time_ms, factor] : {std::pair{61357, 70}, {65535, 255}, {60000, 72}}) { // 2^32 us and some ms
+        go(CANOPEN_SWITCHED_ON);
+        write(0x100C, 0, time_ms);
+        write(0x100D, 0, factor);
+        control(ENABLE);
+        receive(0x700 + NODE, {}, true);
+        for (unsigned i = 0; i < 40; i++) {
+            cycle(1000);
+            receive(0x80, {}); // any sign against the silence of all
+        }
+        expect_state(CANOPEN_OPERATION_ENABLED, "guarded");
+    }
 }
 
 TEST_F(CanopenDrive, other_losses_of_the_master) {

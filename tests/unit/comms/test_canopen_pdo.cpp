@@ -168,8 +168,9 @@ TEST_F(CanopenPdo, the_controlword_of_a_frame_finds_its_mode_and_reference) {
     EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
     EXPECT_EQ(canopen.drive.mode, 9);
     EXPECT_EQ(canopen.drive.target, 600000);
-    receive(0x400 + NODE, {0, 0, 2, 1, 0, 0, 0});
-    EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED) << "a mode that it has not: nothing is taken";
+    receive(0x400 + NODE, {15, 1, 2, 1, 0, 0, 0});
+    EXPECT_EQ(read(0x6040, 0), 15u) << "a mode that it has not: nothing is taken";
+    EXPECT_EQ(canopen.drive.target, 600000);
     cycle();
     sent();
     receive(0x400 + NODE, {0, 0});
@@ -178,6 +179,29 @@ TEST_F(CanopenPdo, the_controlword_of_a_frame_finds_its_mode_and_reference) {
     EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
     receive(0x400 + NODE, {0, 0, 9, 1, 0, 0, 0, 0});
     EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "long: its begin counts";
+}
+
+TEST_F(CanopenPdo, a_stop_is_taken_beside_a_value_that_is_refused) {
+    for (const unsigned word : {0x00u, 0x02u, 0x06u, 0x07u}) {
+        enable();
+        receive(0x300 + NODE, {0x0F, 1, 0x7F}); // halt, with a mode that there is not
+        EXPECT_EQ(read(0x6040, 0), 0x0Fu);
+        receive(0x300 + NODE, {uint8_t(word), 0, 0x7F});
+        EXPECT_EQ(read(0x6040, 0), word);
+        EXPECT_EQ(read(0x6060, 0), 3u);
+        cycle(30);
+        EXPECT_EQ(command.request, COMMAND_OFF) << word;
+        control(0);
+        receive(0x300 + NODE, {0x06, 0, 0x7F});
+        EXPECT_EQ(read(0x6040, 0), 0u) << "nothing but a stop";
+    }
+    control(6);
+    receive(0x300 + NODE, {0x02, 0, 0x7F});
+    control(15);
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "what was prepared is withdrawn";
+    canopen.drive.state = CANOPEN_FAULT;
+    receive(0x300 + NODE, {0x80, 0, 0x7F});
+    EXPECT_NE(read(0x6040, 0), 0x80u) << "no reset";
 }
 
 TEST_F(CanopenPdo, a_controlword_finds_the_references_of_its_sync) {

@@ -390,9 +390,9 @@ TEST_F(CanopenPosition, another_mode_in_a_move_begins_with_what_there_is) {
 
 TEST_F(CanopenPosition, limits_are_ordered_and_reach_the_drive) {
     EXPECT_EQ(write(0x607D, 1, -1000), 0u);
-    EXPECT_EQ(write(0x607D, 2, -1000), 0x06040043u);
+    EXPECT_EQ(write(0x607D, 2, -1000), 0x06090036u);
     EXPECT_EQ(write(0x607D, 2, 500), 0u);
-    EXPECT_EQ(write(0x607D, 1, 501), 0x06040043u);
+    EXPECT_EQ(write(0x607D, 1, 501), 0x06090036u);
     begin(1);
     EXPECT_EQ(command.position.lowest, -1000 * (REV / UNITS));
     EXPECT_EQ(command.position.highest, 500 * (REV / UNITS));

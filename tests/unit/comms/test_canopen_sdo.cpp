@@ -72,6 +72,9 @@ TEST_F(CanopenSdo, reads_and_writes_numbers_in_one_frame) {
     EXPECT_EQ(sdo(head(0x40, 0x1000, 0)), head(0x43, 0x1000, 0, 0x00020192));
     EXPECT_EQ(sdo(head(0x40, 0x6060, 0)), head(0x4F, 0x6060, 0, 3));
     EXPECT_EQ(sdo(head(0x40, 0x60C2, 2)), head(0x4F, 0x60C2, 2, 0xFD)) << "-3 in a byte";
+    EXPECT_EQ(sdo(head(0x2F, 0x60C2, 2, 0xFD)), head(0x60, 0x60C2, 2)) << "a constant may be written as what it is";
+    EXPECT_EQ(sdo(head(0x2F, 0x60C2, 2, 0xFE)), aborted(0x60C2, 2, 0x06090031));
+    EXPECT_EQ(sdo(head(0x2F, 0x60C2, 2, 0xFC)), aborted(0x60C2, 2, 0x06090032));
     EXPECT_EQ(sdo(head(0x2B, 0x1017, 0, 500)), head(0x60, 0x1017, 0));
     EXPECT_EQ(sdo(head(0x40, 0x1017, 0)), head(0x4B, 0x1017, 0, 500));
     EXPECT_EQ(sdo(head(0x22, 0x1017, 0, 700)), head(0x60, 0x1017, 0)) << "expedited without a size";

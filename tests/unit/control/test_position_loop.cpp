@@ -58,7 +58,7 @@ class PositionLoop : public testing::Test {
         set_point.homing = homing;
         set_point.sequence = command.set_point.sequence + 1;
         set_point.target = int64_t(std::llround(target_rev * REV_32));
-        command = position_command(&parameters, &set_point, 1 << 14);
+        command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
     }
 
     position_sample_t sample() const {
@@ -113,7 +113,7 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     position_set_point_t set_point = {};
     set_point.speed_q22 = INT32_MAX;
     set_point.acceleration_rpm_s = set_point.deceleration_rpm_s = set_point.jerk_rpm_s2 = INT32_MAX;
-    const position_command_t most = position_command(&parameters, &set_point, 1 << 14);
+    const position_command_t most = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
     EXPECT_EQ(most.limits.speed, parameters.limits.speed);
     EXPECT_EQ(most.limits.acceleration, parameters.limits.acceleration);
     EXPECT_LE(most.limits.q, parameters.limits.q);
@@ -121,7 +121,7 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     set_point.acceleration_rpm_s = 600;
     set_point.deceleration_rpm_s = INT32_MIN;
     set_point.jerk_rpm_s2 = -1;
-    const position_command_t less = position_command(&parameters, &set_point, 1 << 14);
+    const position_command_t less = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
     EXPECT_NEAR(double(less.limits.speed), 10.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
     EXPECT_NEAR(double(less.limits.acceleration), 10.0 * REV_48 * 1e-6, REV_48 * 1e-9);
     EXPECT_EQ(less.limits.deceleration, parameters.limits.deceleration);
@@ -135,14 +135,33 @@ TEST_F(PositionLoop, an_inertia_that_has_become_known_bounds_the_acceleration) {
     const double own = double(parameters.limits.acceleration);
     for (const auto &[ratio, part] :
          {std::pair{0.2, 1.0}, {1.0, 1.0}, {1.12, 1.0}, {2.0, 0.5}, {5.0, 0.2}, {60.0, 0.125}}) {
-        const position_command_t made = position_command(&parameters, &set_point, int32_t(ratio * (1 << 14)));
+        const position_command_t made = position_command(&parameters, &set_point, int32_t(ratio * (1 << 14)), 1 << 14);
         EXPECT_NEAR(double(made.limits.acceleration), own * part, own * 2e-3) << ratio;
         EXPECT_NEAR(double(made.limits.deceleration), own * part, own * 2e-3) << ratio;
         EXPECT_EQ(made.limits.speed, parameters.limits.speed);
     }
     set_point.acceleration_rpm_s = 600; // what is less stays
-    const position_command_t slow = position_command(&parameters, &set_point, 2 << 14);
+    const position_command_t slow = position_command(&parameters, &set_point, 2 << 14, 1 << 14);
     EXPECT_NEAR(double(slow.limits.acceleration), 10.0 * REV_48 * 1e-6, REV_48 * 1e-9);
+}
+
+TEST_F(PositionLoop, a_load_leaves_less_for_the_acceleration) {
+    position_settings_t of = settings();
+    of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
+    parameters = position_configure(&of);
+    const position_set_point_t set_point = {};
+    const double own = double(parameters.limits.acceleration);
+    for (const auto &[left, ratio, part] : {std::tuple{1.0, 1.0, 1.0},
+                                            {0.75, 1.0, 1.0},
+                                            {0.5, 1.0, 2.0 / 3.0},
+                                            {0.5, 2.0, 1.0 / 3.0},
+                                            {-1.0, 1.0, 0.125},
+                                            {0.5, 0.25, 1.0}}) {
+        const auto made =
+            position_command(&parameters, &set_point, int32_t(ratio * (1 << 14)), int32_t(left * (1 << 14)));
+        EXPECT_NEAR(double(made.limits.acceleration), own * part, own * 2e-3) << left << " " << ratio;
+        EXPECT_NEAR(double(made.limits.deceleration), own * part, own * 2e-3) << left << " " << ratio;
+    }
 }
 
 TEST_F(PositionLoop, a_reference_that_has_left_a_heavier_rotor_behind_goes_on_from_there) {
@@ -175,7 +194,7 @@ TEST_F(PositionLoop, end_stops_of_a_set_point_are_within_those_of_the_parameters
         set_point.bounded = true;
         set_point.lowest = rev(low);
         set_point.highest = rev(high);
-        const position_command_t made = position_command(&parameters, &set_point, 1 << 14);
+        const position_command_t made = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
         return std::pair(double(made.lowest) / REV_48, double(made.highest) / REV_48);
     };
     EXPECT_EQ(bounds(-1.5, 0.25), std::pair(-1.5, 0.25));
@@ -190,19 +209,48 @@ TEST_F(PositionLoop, end_stops_of_a_set_point_are_within_those_of_the_parameters
     EXPECT_TRUE(position.status.limited);
 }
 
+TEST_F(PositionLoop, other_end_stops_move_no_rotor_that_rests_and_shorten_a_move) {
+    order(POSITION_ORDER_PROFILE, 3.0);
+    ticks(2000);
+    command.highest = int64_t(REV_48); // behind the rotor
+    ticks(500);
+    EXPECT_NEAR(rotor_rev, 3.0, 1e-6);
+    command.highest = int64_t(8.0 * REV_48);
+    order(POSITION_ORDER_PROFILE, 10.0);
+    ticks(200);
+    EXPECT_FALSE(position.status.limited);
+    command.highest = int64_t(8.0 * REV_48);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 8.0, 1e-6);
+    EXPECT_TRUE(position.status.limited);
+    order(POSITION_ORDER_PROFILE, 20.0);
+    ticks(250); // on the way, at speed
+    command.highest = int64_t(9.0 * REV_48);
+    const double from = rotor_rev;
+    EXPECT_GT(from, 9.5);
+    ticks(3000);
+    EXPECT_GT(rotor_rev, from - 0.1) << "passed: it stops, and does not return to the stop";
+    EXPECT_LT(rotor_rev, 19.0);
+    order(POSITION_ORDER_PROFILE, 20.0);
+    command.highest = int64_t(9.0 * REV_48);
+    ticks(3000);
+    EXPECT_NEAR(rotor_rev, 9.0, 1e-6) << "a new set point";
+}
+
 TEST_F(PositionLoop, the_period_of_a_set_point_replaces_the_parameters) {
     position_set_point_t set_point = {};
-    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14).cycle.ticks, 4u);
+    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14, 1 << 14).cycle.ticks, 4u);
     set_point.cycle_ms = 50;
-    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14).cycle.ticks, 50u);
+    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14, 1 << 14).cycle.ticks, 50u);
     set_point.cycle_ms = UINT32_MAX;
-    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14).cycle.ticks, unsigned(POSITION_CYCLE_TICKS_MAX));
+    EXPECT_EQ(position_command(&parameters, &set_point, 1 << 14, 1 << 14).cycle.ticks,
+              unsigned(POSITION_CYCLE_TICKS_MAX));
     rotor_rev = 0.0;
     for (int k = 0; k <= 60; k++) { // a line in steps of 100 ms, by its cubic
         set_point.order = POSITION_ORDER_CYCLIC;
         set_point.sequence++;
         set_point.target = int64_t(0.1 * k * REV_32);
-        command = position_command(&parameters, &set_point, 1 << 14);
+        command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
         ticks(100);
         ASSERT_NEAR(rotor_rev, 0.1 * (k - 0.02), 0.05) << k;
         ASSERT_TRUE(k < 5 || std::abs(speed_rev_s - 1.0) < 0.02) << speed_rev_s;
@@ -436,7 +484,7 @@ TEST_F(PositionLoop, any_set_points_keep_the_limits_and_the_formats) {
         set_point.bounded = random() % 2;
         set_point.lowest = std::min(int64_t(random()), int64_t(random())) >> (2 + random() % 40);
         set_point.highest = set_point.lowest + int64_t(random() >> (2 + random() % 40));
-        command = position_command(&parameters, &set_point, 1 << 14);
+        command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
         ticks(1 + int(random() % 8));
         ASSERT_LE(std::abs(position.profile.end.v), PROFILE_SPEED_MAX);
         ASSERT_LE(std::abs(position.profile.end.x), PROFILE_POSITION_MAX);

@@ -256,14 +256,19 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     campaign.add_argument("--out", type=Path, default=OUT / "campaign", metavar="DIR",
                           help="folder (default %(default)s); what it has of these seeds is not run again")
     campaign.add_argument("--jobs", type=_count, metavar="N", help="simultaneous runs (default: number of cores)")
-    campaign.add_argument("--healthy", action="store_true",
+    campaign.add_argument("--healthy", dest="kind", action="store_const", const="healthy", default="faults",
                           help="worlds without faults instead, in which a fault of the drive is a false alarm")
+    campaign.add_argument("--motion", dest="kind", action="store_const", const="motion", default="faults",
+                          help="worlds of positions instead, by drive.dbc or a CANopen master")
     campaign.add_argument("--no-shrink", action="store_true", help="write no folders of failures")
 
     replay = command("replay", "a seed of a campaign, or a failure that it left, once more on the usual bench, with "
                      "log and plot")
     replay.add_argument("what", metavar="SEED|FOLDER")
-    replay.add_argument("--healthy", action="store_true", help="the seed is one of campaign --healthy")
+    replay.add_argument("--healthy", dest="kind", action="store_const", const="healthy", default="faults",
+                        help="the seed is one of campaign --healthy")
+    replay.add_argument("--motion", dest="kind", action="store_const", const="motion", default="faults",
+                        help="the seed is one of campaign --motion")
     replay.add_argument("--out", type=Path, default=OUT / "replay", metavar="DIR",
                         help="parent of the folder for a seed (default %(default)s)")
     replay.add_argument("--target", dest="build", type=_one_of(TARGETS), default=TARGETS[0], metavar="NAME",

@@ -8,7 +8,7 @@ gives equal bytes: the file contains neither date nor version.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -258,6 +258,25 @@ def plot_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
 
 
 # --- helpers --------------------------------------------------------------------------------------------------------
+
+def plot_position(path: Path, time_s: np.ndarray, position_deg: np.ndarray, error_deg: np.ndarray,
+                  targets: Sequence[tuple[float, float]], controller: str) -> None:
+    """Position with its targets, (time, degrees) each, and the following error over time, as the drive tells them."""
+    def draw(figure: Figure) -> None:
+        position, error = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1.0))
+        end_s = float(time_s[-1]) if len(time_s) else 0.0
+        times = [min(at_s, end_s) for at_s, _ in targets]
+        position.step([*times, end_s], [*(deg for _, deg in targets), targets[-1][1]], where="post",
+                      color=PAPER_COLOUR, linewidth=0.9, label="target")
+        _trace(position, time_s, position_deg, controller_colour(controller), label="position")
+        position.legend(loc="best")
+        position.set_title(_title(controller))
+        _trace(error, time_s, error_deg, controller_colour(controller))
+        error.set_xlabel("time / s")
+        _label_rows(np.array([[position], [error]]), "position / deg", "following error / deg")
+
+    _save(path, draw, 1, 5.0, row_gap=0.12)
+
 
 def _grid(figure: Figure, recordings: Recordings, rows: int, heights: tuple[float, ...]) -> np.ndarray:
     return figure.subplots(rows, len(recordings), squeeze=False, gridspec_kw={"height_ratios": heights})

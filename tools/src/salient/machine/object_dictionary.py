@@ -125,7 +125,8 @@ def _entry(index: int, sub: int, row: dict[str, Any], instances: int) -> Entry:
         raise DictionaryError(f"{where}: type, access or reset is not known")
     if ("value" in row) != ("reset" in row) or ("value" in row and "from" in row):
         raise DictionaryError(f"{where}: a variable has value and reset, and no from")
-    if not ({"value", "from", "string"} & set(row) or access == "const"):
+    fixed = access == "const" or (access == "rw" and row.get("minimum") == row.get("maximum") == row.get("initial"))
+    if not ({"value", "from", "string"} & set(row) or fixed):
         raise DictionaryError(f"{where}: has neither value nor from nor a constant")
     low, high = type_range(kind) if kind in BITS else (0, 0)
     minimum, maximum = row.get("minimum", low), row.get("maximum", high)

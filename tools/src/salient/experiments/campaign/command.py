@@ -17,7 +17,18 @@ from salient.errors import UsageError
 from salient.experiments import planted
 from salient.experiments.campaign import known, names
 from salient.experiments.campaign.failure import Failure, classes, load, replay, save
-from salient.experiments.campaign.runner import ALL_EVENTS, Result, commit, digest, processor_s, serve, world
+from salient.experiments.campaign.runner import (
+    ALL_EVENTS,
+    FAULTS,
+    HEALTHY,
+    MOTION,
+    Result,
+    commit,
+    digest,
+    processor_s,
+    serve,
+    world,
+)
 from salient.experiments.tasks import Task, read_results, run
 from salient.paths import BUILD, make_folder
 from salient.progress import Progress
@@ -25,13 +36,14 @@ from salient.progress import Progress
 _SHOWN_MAX = 8
 """Failures that are shrunk, one of each class, and seeds that a summary lists of a class."""
 _LINES = 20
+_WORLDS = {FAULTS: "worlds with faults", HEALTHY: "healthy worlds", MOTION: "worlds of positions"}
 
 
 def run_campaign(options: argparse.Namespace) -> int:
     """`campaign`; returns the exit code."""
     seeds = range(options.first, options.first + options.seeds)
-    kind = "healthy" if options.healthy else "faults"
-    tasks = [Task(f"{kind} {seed} {digest()}", (seed, options.healthy, digest())) for seed in seeds]
+    kind = options.kind
+    tasks = [Task(f"{kind} {seed} {digest()}", (seed, kind, digest())) for seed in seeds]
     mine = tasks[options.shard[0] - 1::options.shard[1]]
     results: list[Result] = []
     new: list[Result] = []
@@ -59,7 +71,7 @@ def run_campaign(options: argparse.Namespace) -> int:
         seed = entry["seeds"][0]
         folder = options.out / "failures" / _folder_name(seed, violation, saved_seeds)
         saved_seeds.add(seed)
-        saved = save(seed, violation, folder, options.healthy)
+        saved = save(seed, violation, folder, kind)
         events = ", ".join(f"{event['event']} at {event['begin_us']} us" for event in saved["world"]["events"])
         print(f"{violation}: seed {seed} needs {len(saved['world']['events'])} events ({events or 'none'}); "
               f"{saved['replay']}")
@@ -88,18 +100,18 @@ def summary(results: Iterable[Result], first: int, seeds: int, kind: str) -> dic
         rejected += result.get("rejected", False)
         cells.update(result.get("cells", ()))
         classes = {names.violation(violation) for violation in result.get("violations", ())}
-        listed = known.of_world(int(result["seed"]), kind == "healthy")
+        listed = known.of_world(int(result["seed"]), kind)
         for violation in classes:
             (deviations if violation in listed else found)[violation].append(result["seed"])
         gone += [f"{result['seed']} {violation}" for violation in sorted(listed - classes)]
-    missing = [] if kind == "healthy" else [cell for cell in names.cells() if cell not in cells]
+    missing = [] if kind != FAULTS else [cell for cell in names.cells() if cell not in cells]
     return {
         "kind": kind, "first": first, "seeds": seeds, "finished": finished, "commit": commit(),
         "program_and_machines": digest(), "results_sha256": content.hexdigest(),
         "virtual_hours": round(virtual_us / 3.6e9, 4), "rejected": rejected,
         "recovered": recovered, "held_by_the_encoder": held,
         "violations": _by_number(found), "known_deviations": _by_number(deviations), "known_and_gone": gone,
-        "cells_reached": len(cells), "cells": 0 if kind == "healthy" else len(names.cells()),
+        "cells_reached": len(cells), "cells": 0 if kind != FAULTS else len(names.cells()),
         "cells_not_reached": [names.cell(cell) for cell in missing],
     }
 
@@ -118,7 +130,7 @@ def report(note: dict[str, Any]) -> list[str]:
     """A summary to be read."""
     number, deviations = (sum(entry["count"] for entry in note[of].values())
                           for of in ("violations", "known_deviations"))
-    lines = [f"{note['finished']} {'healthy worlds' if note['kind'] == 'healthy' else 'worlds with faults'} "
+    lines = [f"{note['finished']} {_WORLDS[note['kind']]} "
              f"from seed {note['first']}, {note['virtual_hours']:g} h of virtual time, commit {note['commit']}: "
              f"{number} violations, {deviations} known deviations"]
     lines += [f"  {kind}{name}: {entry['count']}, first seeds {', '.join(map(str, entry['seeds']))}"
@@ -141,14 +153,14 @@ def run_replay(options: argparse.Namespace) -> int:
         failure = load(folder)
     else:
         try:
-            failure = Failure(int(options.what), ALL_EVENTS, options.healthy, None)
+            failure = Failure(int(options.what), ALL_EVENTS, options.kind, None)
         except ValueError:
-            failure = Failure(-1, ALL_EVENTS, options.healthy, None)
+            failure = Failure(-1, ALL_EVENTS, options.kind, None)
         if not 0 <= failure.seed < 2**63:
             raise UsageError(f"replay {options.what}: must be a seed, a whole number from 0, or the folder of a "
                              "failure")
         folder = options.out / str(failure.seed)
-    seed, kept, healthy = failure.seed, failure.kept, failure.healthy
+    seed, kept, kind = failure.seed, failure.kept, failure.kind
     programs = None
     if failure.bug is not None:
         if options.build != "host":
@@ -156,7 +168,7 @@ def run_replay(options: argparse.Namespace) -> int:
         programs = planted.campaign_programs(planted.named(failure.bug), BUILD / "campaign" / "planted")
         print(f"with the planted bug '{failure.bug}'")
     make_folder(folder)
-    described = world(seed, kept, healthy)
+    described = world(seed, kept, kind)
     print(f"seed {seed}: {described['machine']}, {described['controller']}, {described['control_rate_hz']} Hz, encoder "
           f"of {described['encoder_bits']} bits{' with edges' if described['encoder_edges'] else ''}")
     for event in described["events"]:
@@ -164,9 +176,9 @@ def run_replay(options: argparse.Namespace) -> int:
         print(f"  {event['begin_us']}{until} us: {event['event']} {event['value']:g}"
               + (f", phase {PHASES[event['phase']]}, leg {('low', 'high')[event['leg']]}"
                  if event["phase"] or event["leg"] else ""))
-    again = replay(seed, kept, healthy, folder, options.build, programs)
+    again = replay(seed, kept, kind, folder, options.build, programs)
     whole = kept == ALL_EVENTS and failure.bug is None
-    listed = known.of_world(seed, healthy) if whole else set()
+    listed = known.of_world(seed, kind) if whole else set()
     for violation in again.campaign["violations"]:
         word = "known deviation" if names.violation(violation) in listed else "violation"
         print(f"{word}: {names.violation(violation)} at {violation['at_us']} us")

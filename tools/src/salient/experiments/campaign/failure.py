@@ -21,9 +21,11 @@ from salient.config import BenchConfig
 from salient.errors import UsageError
 from salient.experiments.campaign import names
 from salient.experiments.campaign.machines import files
-from salient.experiments.campaign.runner import ALL_EVENTS, Programs, Result, run_world, world
+from salient.experiments.campaign.runner import ALL_EVENTS, FAULTS, KINDS, Programs, Result, run_world, world
 
 _STEP_NS = 1_000_000
+_EXTENDED, _REMOTE = 0x80000000, 0x40000000
+"""Bits of an identifier, as Linux has them."""
 _FEW = 3
 _CRASH_MAX_S = 60
 """Processor time of a bench that is to crash: it may do so by not ending."""
@@ -37,15 +39,15 @@ def classes(result: Result) -> list[str]:
     return [names.violation(violation) for violation in result["violations"]]
 
 
-def shrink(seed: int, violation: str, healthy: bool = False, programs: Programs | None = None) -> int:
+def shrink(seed: int, violation: str, kind: str = FAULTS, programs: Programs | None = None) -> int:
     """The events, as bits, of a short list that still has a violation of this class: no event of it can be left out.
     Leaves out halves, quarters, ... first (A. Zeller, R. Hildebrandt, "Simplifying and isolating failure-inducing
     input", 2002). Of what is left with more than _FEW events every list of at most so many is tried."""
-    every = [event["index"] for event in world(seed, healthy=healthy)["events"]]
+    every = [event["index"] for event in world(seed, kind=kind)["events"]]
     events = every
 
     def fails(kept: list[int]) -> bool:
-        return violation in classes(run_world(seed, sum(1 << index for index in kept), healthy, programs=programs))
+        return violation in classes(run_world(seed, sum(1 << index for index in kept), kind, programs=programs))
 
     part = len(events)
     while part >= 1:
@@ -77,20 +79,22 @@ class Replay:
         return self.hash == str(self.campaign.get("hash", ""))
 
 
-def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Path | None = None,
+def replay(seed: int, kept: int = ALL_EVENTS, kind: str = FAULTS, folder: Path | None = None,
            build: str = "host", programs: Programs | None = None) -> Replay:
     """Runs a world again, and its frames once more on a test bench of salient_host, or of a target's build. folder: for
     log and plots of the bench, around the first violation or, without one, the end."""
-    described = world(seed, kept, healthy)
+    described = world(seed, kept, kind)
     with tempfile.TemporaryDirectory(prefix="salient-") as temporary:
         frames = Path(temporary) / "frames"
-        result = run_world(seed, kept, healthy, frames, programs)
+        result = run_world(seed, kept, kind, frames, programs)
         path = next(path for path in files() if path.stem == described["machine"])
         config = BenchConfig(machine=str(path), controller=described["controller"], seed=seed, build=build,
                              control_rate_hz=described["control_rate_hz"], encoder_bits=described["encoder_bits"],
                              adc_bits=described["adc_bits"], encoder_edges=described["encoder_edges"],
                              initial_angle_deg=described["initial_angle_deg"],
-                             telemetry_period_ms=TELEMETRY_PERIOD_MS, program=programs.host if programs else None)
+                             telemetry_period_ms=TELEMETRY_PERIOD_MS,
+                             protocol="canopen" if described["client"] == "canopen" else "salient",
+                             program=programs.host if programs else None)
         lines = frames.read_text(encoding="ascii").rpartition("\n")[0].splitlines()
         try:
             with Bench(config, f"unix:{temporary}/can.sock") as bench:
@@ -98,8 +102,8 @@ def replay(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, folder: Pat
                     resource.prlimit(bench.simulator.pid, resource.RLIMIT_CPU, (_CRASH_MAX_S, _CRASH_MAX_S))
                 send_frames(bench, lines)
                 if folder is not None:
-                    again = (f"{seed}{' --healthy' if healthy else ''}" if kept == ALL_EVENTS and programs is None else
-                             folder)
+                    whole = kept == ALL_EVENTS and programs is None
+                    again = f"{seed}{'' if kind == FAULTS else f' --{kind}'}" if whole else folder
                     notes = {"replay": f"tools/salient replay {again}", "world": f"Campaign, seed {seed}"}
                     _save_bench(bench, folder, notes, result, config)
                 computed = f"{_hash(bench.log):016x}"
@@ -125,8 +129,8 @@ def send_frames(bench: Bench, lines: list[str]) -> None:
         for line in lines:
             time, client, identifier, *data = line.split()
             number = int(identifier, 16)
-            extended = bool(number & 0x80000000)
-            message = can.Message(arbitration_id=number & 0x1FFFFFFF, is_extended_id=extended,
+            extended, remote = bool(number & _EXTENDED), bool(number & _REMOTE)
+            message = can.Message(arbitration_id=number & 0x1FFFFFFF, is_extended_id=extended, is_remote_frame=remote,
                                   data=bytes.fromhex(data[0] if data else ""))
             if extended and message.arbitration_id == 0x1F000001:  # RIG_RUN_UNTIL
                 bench.advance_to(int(time) + _STEP_NS)
@@ -150,22 +154,23 @@ def _hash(log: list[tuple[int, can.Message]]) -> int:
         if message.is_extended_id:
             if 0x1F000000 <= identifier <= 0x1F0007FF and identifier not in _TRUTH:
                 continue
-            identifier |= 0x80000000
+            identifier |= _EXTENDED
+        identifier |= _REMOTE if message.is_remote_frame else 0
         data = bytes(message.data)
         for byte in time_ns.to_bytes(8, "little") + identifier.to_bytes(4, "little") + bytes([len(data)]) + data:
             value = (value ^ byte) * _HASH_PRIME & _HASH_MASK
     return value
 
 
-def save(seed: int, violation: str, folder: Path, healthy: bool = False, bug: str | None = None,
+def save(seed: int, violation: str, folder: Path, kind: str = FAULTS, bug: str | None = None,
          programs: Programs | None = None) -> dict[str, Any]:
     """Shrinks a failing seed and writes its folder: failure.json with the events that are left, log and plot. bug: name
     of the planted one that the programs have."""
     folder.mkdir(parents=True, exist_ok=True)
-    kept = shrink(seed, violation, healthy, programs)
-    again = replay(seed, kept, healthy, folder, programs=programs)
-    note = {"seed": seed, "healthy": healthy, "bug": bug, "kept": f"{kept:#x}", "violation": violation,
-            "hash": again.hash, "equal": again.equal, "world": world(seed, kept, healthy), "result": again.campaign,
+    kept = shrink(seed, violation, kind, programs)
+    again = replay(seed, kept, kind, folder, programs=programs)
+    note = {"seed": seed, "kind": kind, "bug": bug, "kept": f"{kept:#x}", "violation": violation,
+            "hash": again.hash, "equal": again.equal, "world": world(seed, kept, kind), "result": again.campaign,
             "replay": f"tools/salient replay {folder}"}
     (folder / "failure.json").write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     return note
@@ -177,8 +182,14 @@ class Failure:
 
     seed: int
     kept: int
-    healthy: bool
+    kind: str
     bug: str | None
+
+
+def _kind(text: str) -> str:
+    if text not in KINDS:
+        raise ValueError(f"kind {text}")
+    return text
 
 
 def load(folder: Path) -> Failure:
@@ -187,7 +198,7 @@ def load(folder: Path) -> Failure:
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
         bug = note.get("bug")
-        return Failure(int(note["seed"]), int(note["kept"], 16), bool(note["healthy"]),
+        return Failure(int(note["seed"]), int(note["kept"], 16), _kind(note["kind"]),
                        None if bug is None else str(bug))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "

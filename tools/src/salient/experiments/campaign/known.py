@@ -14,7 +14,7 @@ from salient.errors import RunFailed
 from salient.paths import ROOT
 
 FILE = ROOT / "tests" / "campaign" / "known.toml"
-_KEYS = {"seed": int, "healthy": bool, "violation": str, "reason": str}
+_KEYS = {"seed": int, "kind": str, "violation": str, "reason": str}
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Known:
     """A deviation: the world, the class of its violation, and the physical reason."""
 
     seed: int
-    healthy: bool
+    kind: str
     violation: str
     reason: str
 
@@ -34,7 +34,7 @@ def parse(text: str) -> tuple[Known, ...]:
         if entry.keys() != _KEYS.keys() or not all(isinstance(entry[key], kind) for key, kind in _KEYS.items()):
             raise RunFailed(f"{FILE.relative_to(ROOT)}: {entry}: must have {', '.join(_KEYS)}")
     found = tuple(Known(**entry) for entry in entries)
-    if len({(each.seed, each.healthy, each.violation) for each in found}) < len(found):
+    if len({(each.seed, each.kind, each.violation) for each in found}) < len(found):
         raise RunFailed(f"{FILE.relative_to(ROOT)}: an entry is there twice")
     return found
 
@@ -45,7 +45,7 @@ def known() -> tuple[Known, ...]:
     return parse(FILE.read_text(encoding="utf-8"))
 
 
-def of_world(seed: int, healthy: bool) -> set[str]:
+def of_world(seed: int, kind: str) -> set[str]:
     """Classes of the known violations of a world."""
-    return {each.violation for each in known() if (each.seed, each.healthy) == (seed, healthy)}
+    return {each.violation for each in known() if (each.seed, each.kind) == (seed, kind)}
 

@@ -19,6 +19,7 @@ _REASONS = {
                 6: "before both lines were off"},
     "wrong_telemetry": {**dict.fromkeys(range(4), "current"), 8: "link voltage", 9: "speed"},
     "wrong_snapshot": {16: "speed", 17: "link voltage", 18: "current"},
+    "quick_stop": {1: "faster", 2: "gates on", 3: "not at rest"},
     "not_recovered": {1: "not in run", 2: "not at the speed", 3: "fault again", 4: "with a phase left out"},
 }
 

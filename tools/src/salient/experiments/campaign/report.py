@@ -15,6 +15,7 @@ from typing import Any
 
 from salient.experiments import fault_table, planted
 from salient.experiments.campaign import branching, same_bits
+from salient.experiments.campaign.runner import FAULTS
 from salient.paths import REFERENCE, ROOT
 
 PAGE = REFERENCE / "campaign.md"
@@ -75,8 +76,8 @@ def _worlds(name: str, what: str, sharding: str = "") -> tuple[str, str, str]:
         rest = "" if all_reached else f", the rest in `tests/campaign/{name}.json`"
         parts += [f"{note['cells_reached']:,} of {note['cells']:,} cells of fault, state and sector reached{rest}",
                   f"{note['held_by_the_encoder']} drives held at rest by their encoder"]
-    healthy = " --healthy" if note["kind"] == "healthy" else ""
-    return what, "; ".join(parts), f"`campaign{healthy} --first {note['first']} --seeds {note['seeds']}{sharding}`"
+    kind = "" if note["kind"] == FAULTS else f" --{note['kind']}"
+    return what, "; ".join(parts), f"`campaign{kind} --first {note['first']} --seeds {note['seeds']}{sharding}`"
 
 
 def _branches() -> tuple[str, str, str]:

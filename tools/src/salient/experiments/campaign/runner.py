@@ -22,6 +22,8 @@ from salient.paths import BUILD, ROOT, from_root
 Result = dict[str, Any]
 """seed, hash, machine, controller, virtual_us, causes, recovered, held, violations, cells."""
 ALL_EVENTS = 2**64 - 1
+FAULTS, HEALTHY, MOTION = KINDS = ("faults", "healthy", "motion")
+"""Kinds of worlds: with faults; without; of positions, by drive.dbc or a CANopen master."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +79,16 @@ def _lines(options: Sequence[object], programs: Programs | None = None) -> list[
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False) -> Result:
+def world(seed: int, kept: int = ALL_EVENTS, kind: str = FAULTS) -> Result:
     """World of a seed: machine, board, events."""
-    return _lines(["--first", seed, "--keep", kept, "--describe", *_mode(healthy)])[0]
+    return _lines(["--first", seed, "--keep", kept, "--describe", *_mode(kind)])[0]
 
 
-def run_world(seed: int, kept: int = ALL_EVENTS, healthy: bool = False, frames: Path | None = None,
+def run_world(seed: int, kept: int = ALL_EVENTS, kind: str = FAULTS, frames: Path | None = None,
               programs: Programs | None = None) -> Result:
     """Runs a world, with the events whose bits are set. frames: a file for the frames that its clients sent, a
     line each: time in ns, number of the client, identifier with flags and data in hexadecimal."""
-    options = ["--first", seed, "--keep", kept, *_mode(healthy), *(["--frames", frames] if frames else [])]
+    options = ["--first", seed, "--keep", kept, *_mode(kind), *(["--frames", frames] if frames else [])]
     return _lines(options, programs)[0]
 
 
@@ -112,21 +114,21 @@ def processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _mode(healthy: bool) -> list[str]:
-    return ["--healthy"] if healthy else []
+def _mode(kind: str) -> list[str]:
+    return [] if kind == FAULTS else [f"--{kind}"]
 
 
-_served: dict[bool, subprocess.Popen[str]] = {}
+_served: dict[str, subprocess.Popen[str]] = {}
 
 
-def serve(task: tuple[int, bool, str]) -> Result:
-    """Runs a seed in a program of this process that stays; task: seed, healthy, and the digest() that everybody must
+def serve(task: tuple[int, str, str]) -> Result:
+    """Runs a seed in a program of this process that stays; task: seed, kind, and the digest() that everybody must
     have. For workers."""
-    seed, healthy, expected = task
+    seed, kind, expected = task
     check_build(digest(), expected)
-    process = _served.get(healthy)
+    process = _served.get(kind)
     if process is None or process.poll() is not None:
-        process = _served[healthy] = subprocess.Popen(command("--serve", *_mode(healthy)), stdin=subprocess.PIPE,
+        process = _served[kind] = subprocess.Popen(command("--serve", *_mode(kind)), stdin=subprocess.PIPE,
                                                       stdout=subprocess.PIPE, text=True)
         util.Finalize(process, process.communicate, exitpriority=0)  # its processor time becomes the worker's
     assert process.stdin is not None and process.stdout is not None  # pipes
