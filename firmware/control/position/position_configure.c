@@ -119,7 +119,8 @@ COLD static int64_t acceleration_left(const position_parameters_t *parameters, i
     if (ratio_q14 <= RATIO_LARGE_Q14 && left_q14 == USED_Q14) {
         return INT64_MAX;
     }
-    const int64_t most = parameters->acceleration_max - parameters->acceleration_max / USED_Q14 * (USED_Q14 - left_q14);
+    const int64_t unit = fixed_divide(parameters->acceleration_max, USED_Q14);
+    const int64_t most = parameters->acceleration_max - unit * (USED_Q14 - left_q14);
     return fixed_divide(most, fixed_max(ratio_q14, RATIO_MIN_Q14)) << 14;
 }
 
