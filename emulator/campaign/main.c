@@ -24,6 +24,7 @@
 #include "campaign/flips.h"
 #include "campaign/run.h"
 #include "campaign/world_draw.h"
+#include "campaign/world_motion.h"
 #include "host/host_drive.h"
 
 #define EXIT_USAGE 2

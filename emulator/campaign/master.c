@@ -21,19 +21,6 @@ static void put(sender_t *sender, const transport_receiver_t *receiver, unsigned
     sender_put(sender, receiver, client, identifier, data, length);
 }
 
-const world_event_t *master_event(const sender_t *sender, world_kind_t kind, bool active) {
-    const world_t *world = sender->world;
-    const world_event_t *latest = NULL;
-    for (unsigned i = 0; i < world->events; i++) {
-        const world_event_t *event = world_begun(world, i, sender->time_us);
-        if (event != NULL && event->kind == kind && (!active || world_active(world, i, sender->time_us)) &&
-            (latest == NULL || event->begin_us >= latest->begin_us)) {
-            latest = event;
-        }
-    }
-    return latest;
-}
-
 /* --- Before the drive runs --- */
 
 typedef struct {
@@ -141,8 +128,9 @@ static void put_orders(sender_t *sender, const transport_receiver_t *receiver) {
 
 static void step_master(sender_t *sender, const transport_receiver_t *receiver) {
     master_t *master = &sender->master;
-    const world_event_t *nmt = master_event(sender, WORLD_NMT, false);
-    if (sender->time_us < CONFIGURED_FROM_US || master_event(sender, WORLD_LOST, true) != NULL) {
+    const world_event_t *nmt = world_latest(sender->world, WORLD_NMT, sender->time_us, false);
+    if (sender->time_us < CONFIGURED_FROM_US ||
+        world_latest(sender->world, WORLD_LOST, sender->time_us, true) != NULL) {
         return;
     }
     if (nmt != NULL && sender_in_step(sender, nmt->begin_us)) {
@@ -196,12 +184,12 @@ static void put_noise(sender_t *sender, const transport_receiver_t *receiver) {
 }
 
 static void step_others(sender_t *sender, const transport_receiver_t *receiver) {
-    if (master_event(sender, WORLD_NOISE, true) != NULL) {
+    if (world_latest(sender->world, WORLD_NOISE, sender->time_us, true) != NULL) {
         for (uint64_t count = draw(sender) % (NOISE_MAX + 1); count > 0; count--) {
             put_noise(sender, receiver);
         }
     }
-    const world_event_t *rival = master_event(sender, WORLD_MASTER, true);
+    const world_event_t *rival = world_latest(sender->world, WORLD_MASTER, sender->time_us, true);
     if (rival != NULL && sender->time_us % 10000 == 0) {
         put(sender, receiver, SENDER_RIVAL, 0x300 + MASTER_NODE, rival->what | UINT64_C(3) << 16, 3);
     }

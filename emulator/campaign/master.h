@@ -94,7 +94,4 @@ master_orders_t master_orders(struct sender *sender);
 void master_on_bus(struct sender *sender, uint64_t time_ns, const struct can_frame *frame);
 void master_on_frame(struct sender *sender, uint64_t time_ns, const struct can_frame *frame);
 
-/* The latest event of a kind that has begun; NULL: none. active: and not ended. */
-const world_event_t *master_event(const struct sender *sender, world_kind_t kind, bool active);
-
 #endif

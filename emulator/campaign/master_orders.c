@@ -12,7 +12,7 @@ enum { ORDER = 0x10, IMMEDIATELY = 0x20, RELATIVE = 0x40, ENABLED = 0x0F };
 /* Next step towards operation enabled. */
 static uint16_t towards_enabled(const sender_t *sender, uint16_t status) {
     const world_master_t *setting = &sender->world->master;
-    const bool eager = master_event(sender, WORLD_EAGER, true) != NULL;
+    const bool eager = world_latest(sender->world, WORLD_EAGER, sender->time_us, true) != NULL;
     if ((status & NO_FLAG_BITS) == 0x40) {
         return 0x06;
     }
@@ -67,7 +67,7 @@ static uint16_t order_move(sender_t *sender, int32_t *position) {
 static int32_t lead(sender_t *sender) {
     master_t *master = &sender->master;
     const world_master_t *setting = &sender->world->master;
-    const world_event_t *to = master_event(sender, WORLD_TARGET, false);
+    const world_event_t *to = world_latest(sender->world, WORLD_TARGET, sender->time_us, false);
     if (!master->follows) {
         master->follows = master->drive.placed;
         master->place_rev = master->drive.position / MASTER_UNITS;
@@ -86,9 +86,9 @@ static int32_t lead(sender_t *sender) {
 master_orders_t master_orders(sender_t *sender) {
     master_t *master = &sender->master;
     const world_master_t *setting = &sender->world->master;
-    const world_event_t *mode = master_event(sender, WORLD_MODE, false),
-                        *control = master_event(sender, WORLD_CONTROL, true),
-                        *aim = master_event(sender, WORLD_TARGET, false);
+    const world_event_t *mode = world_latest(sender->world, WORLD_MODE, sender->time_us, false),
+                        *control = world_latest(sender->world, WORLD_CONTROL, sender->time_us, true),
+                        *aim = world_latest(sender->world, WORLD_TARGET, sender->time_us, false);
     const double sign = aim == NULL ? 0.0 : copysign(1.0, aim->value);
     master_orders_t orders = {
         .mode = (uint8_t)(mode != NULL ? mode->what : setting->mode),

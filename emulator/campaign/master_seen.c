@@ -151,7 +151,7 @@ void master_on_bus(sender_t *sender, uint64_t time_ns, const struct can_frame *f
     if (frame->can_id & CAN_EFF_FLAG) {
         return;
     }
-    wish->unsure = wish->unsure || master_event(sender, WORLD_NOISE, true) != NULL;
+    wish->unsure = wish->unsure || world_latest(sender->world, WORLD_NOISE, sender->time_us, true) != NULL;
     wish->sign_ns = is_sign(sender, frame) ? time_ns : wish->sign_ns;
     const unsigned base = frame->can_id & 0x780u;
     const bool own = (frame->can_id & 0x7Fu) == MASTER_NODE;

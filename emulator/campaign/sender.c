@@ -185,7 +185,7 @@ static void take_references(sender_t *sender) {
 
 /* In position mode the drive holds until the first target. */
 static void command_position(sender_t *sender, const transport_receiver_t *receiver, sender_request_t request) {
-    const world_event_t *target = master_event(sender, WORLD_TARGET, false);
+    const world_event_t *target = world_latest(sender->world, WORLD_TARGET, sender->time_us, false);
     sender->request = request;
     sender->due_us = sender->time_us + SENDER_COMMAND_PERIOD_US;
     sender_put_position(sender, receiver, sender->counter++, request, target != NULL,

@@ -59,6 +59,18 @@ bool world_active(const world_t *world, unsigned event, uint64_t time_us) {
     return each != NULL && (each->end_us == 0 || time_us < each->end_us);
 }
 
+const world_event_t *world_latest(const world_t *world, world_kind_t kind, uint64_t time_us, bool active) {
+    const world_event_t *latest = NULL;
+    for (unsigned i = 0; i < world->events; i++) {
+        const world_event_t *event = world_begun(world, i, time_us);
+        if (event != NULL && event->kind == kind && (!active || world_active(world, i, time_us)) &&
+            (latest == NULL || event->begin_us >= latest->begin_us)) {
+            latest = event;
+        }
+    }
+    return latest;
+}
+
 const char *world_event_name(const world_event_t *event) {
     static const char *const names[] = {
         [WORLD_SPEED] = "speed_reference",

@@ -138,6 +138,9 @@ const world_event_t *world_begun(const world_t *world, unsigned event, uint64_t 
 /* True when the event is kept and active at a time. */
 bool world_active(const world_t *world, unsigned event, uint64_t time_us);
 
+/* The latest event of a kind that has begun at a time; NULL: none. active: and not ended. */
+const world_event_t *world_latest(const world_t *world, world_kind_t kind, uint64_t time_us, bool active);
+
 /* Name of what an event is, for the description. */
 const char *world_event_name(const world_event_t *event);
 

@@ -10,9 +10,8 @@
 void world_draw_board(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 void world_draw_imperfections(world_t *world);
 
-/* With faults; a healthy one; one of positions or with a CANopen master (world_motion.c). */
+/* With faults; a healthy one. */
 void world_draw(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 void world_draw_healthy(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
-void world_draw_motion(world_t *world, const world_machine_t *machines, unsigned count, uint64_t seed);
 
 #endif

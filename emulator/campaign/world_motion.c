@@ -1,3 +1,5 @@
+#include "campaign/world_motion.h"
+
 #include <math.h>
 
 #include "bench_variables.h"

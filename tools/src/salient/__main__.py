@@ -89,6 +89,11 @@ def _run(options: argparse.Namespace) -> int:
     make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
                       progress=lambda line: print(line, flush=True))
+    if scenarios[0].position:
+        from salient.experiments.plots import plot_position  # matplotlib, for these alone
+
+        for result in results.values():
+            plot_position(result)
     print(f"results: {out / 'results.json'}")
     faults = [f"{controller}: {result.fault}" for controller, result in results.items() if result.fault != "none"]
     if faults:

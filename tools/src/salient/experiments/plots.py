@@ -8,7 +8,7 @@ gives equal bytes: the file contains neither date nor version.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from salient.experiments.metrics import BAND, RIPPLE_WINDOW_S
-from salient.experiments.scenario import LoadStep
+from salient.experiments.scenario import LoadStep, RunResult
 from salient.pages import controller_colour
 
 Recordings = Mapping[str, np.ndarray]
@@ -259,9 +259,16 @@ def plot_phase_currents(path: Path, recordings: Recordings, from_s: float = RIPP
 
 # --- helpers --------------------------------------------------------------------------------------------------------
 
-def plot_position(path: Path, time_s: np.ndarray, position_deg: np.ndarray, error_deg: np.ndarray,
-                  targets: Sequence[tuple[float, float]], controller: str) -> None:
-    """Position with its targets, (time, degrees) each, and the following error over time, as the drive tells them."""
+def plot_position(result: RunResult) -> None:
+    """position.png in the folder of a run with positions: position with its targets, and the following error over
+    time, as the drive tells them."""
+    told = result.telemetry
+    position_told, error_told = told["DRIVE_POSITION.position_deg"], told["DRIVE_POSITION.following_error_deg"]
+    time_s = np.asarray(position_told.time_s)
+    position_deg, error_deg = (np.asarray(each.value, dtype=float) for each in (position_told, error_told))
+    targets = [(step.at_s, step.value_deg) for step in result.scenario.position]
+    controller = result.scenario.controller
+
     def draw(figure: Figure) -> None:
         position, error = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1.0))
         end_s = float(time_s[-1]) if len(time_s) else 0.0
@@ -275,7 +282,7 @@ def plot_position(path: Path, time_s: np.ndarray, position_deg: np.ndarray, erro
         error.set_xlabel("time / s")
         _label_rows(np.array([[position], [error]]), "position / deg", "following error / deg")
 
-    _save(path, draw, 1, 5.0, row_gap=0.12)
+    _save(result.folder / "position.png", draw, 1, 5.0, row_gap=0.12)
 
 
 def _grid(figure: Figure, recordings: Recordings, rows: int, heights: tuple[float, ...]) -> np.ndarray:

@@ -325,21 +325,8 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
         results[scenario.controller] = run_scenario(scenario, out_dir / scenario.controller, can, build,
                                                     instruction_ns=instruction_ns)
-        if scenario.position:
-            _plot_position(results[scenario.controller])
     write_summaries(scenarios, results, out_dir)
     return results
-
-
-def _plot_position(result: RunResult) -> None:
-    """position.png in the folder of a run."""
-    from salient.experiments.plots import plot_position  # matplotlib, for those who plot
-
-    told = result.telemetry
-    position, error = told["DRIVE_POSITION.position_deg"], told["DRIVE_POSITION.following_error_deg"]
-    plot_position(result.folder / "position.png", np.asarray(position.time_s), np.asarray(position.value, dtype=float),
-                  np.asarray(error.value, dtype=float),
-                  [(step.at_s, step.value_deg) for step in result.scenario.position], result.scenario.controller)
 
 
 def check_parameters(scenarios: list[Scenario], build: str) -> None:

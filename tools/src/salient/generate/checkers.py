@@ -35,9 +35,9 @@ _GROUPS = {
 
 
 def table() -> list[tuple[str, str]]:
-    """Group and name of each checker, in the order of the table in the code."""
+    """Group and name of each checker, in the order of the table in the code, which also has its kinds of worlds."""
     text = (CAMPAIGN / "checkers" / "table.c").read_text(encoding="utf-8")
-    return re.findall(r"\{(CHECKER_\w+), &(\w+)_checker\}", text)
+    return re.findall(r"\{(CHECKER_\w+), CHECKER_\w+, &(\w+)_checker\}", text)
 
 
 def property_of(name: str) -> str:
