@@ -47,7 +47,7 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 # --- the list of members --------------------------------------------------------------------------------------------
 
 NESTED = ("machine_format_t", "magnetics_t", "converter_t", "dc_link_t", "sensor_errors_t", "sensor_ranges_t",
-          "thermal_data_t")
+          "thermal_data_t", "circuit_t")
 
 
 def members_of(structure: str) -> list[str]:
