@@ -316,64 +316,22 @@ def test_control_interrupt_preempts_the_deferred_one_and_their_data_is_torn_only
     ("salient", {"smc_k": 500.0, "observer_steady_rad_s": 400.0}),
 ])
 def test_tuning_in_a_run_delays_the_control_interrupt_by_less_than_a_microsecond(make_bench, controller, tuned):
-    bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8)
-    bench.load_torque_Nm = 6
-    bench.drive.speed_reference_rpm = 600
-    bench.run_for(0.35)
-    before_us = processor(bench, "worst_us")
-    for step in range(40):
-        bench.drive.parameters.update({name: value * (1 + step / 100) for name, value in tuned.items()})
-    bench.run_for(0.11)
-    print(controller, f"longest control interrupt: {before_us:.2f} us before, {processor(bench, 'worst_us'):.2f} us")
-    assert bench.drive.state == "run"
-    assert before_us <= processor(bench, "worst_us") < before_us + 1
-    assert processor(bench, "late_interrupts") == 0
+    """Against a run that is as long and is not tuned: the longest path of an interrupt may come late in a run."""
+    def longest_us(changes: int, end_ns: int) -> tuple[float, int]:
+        bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8)
+        bench.load_torque_Nm = 6
+        bench.drive.speed_reference_rpm = 600
+        bench.run_for(0.35)
+        before_us = processor(bench, "worst_us")
+        for step in range(changes):
+            bench.drive.parameters.update({name: value * (1 + step / 100) for name, value in tuned.items()})
+        bench.advance_to(max(end_ns, bench.time_ns + 110_000_000))
+        assert bench.drive.state == "run"
+        assert before_us <= processor(bench, "worst_us")
+        assert processor(bench, "late_interrupts") == 0
+        return processor(bench, "worst_us"), bench.time_ns
 
-
-# --- the deferred interrupt -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.in_turns
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_deferred_interrupt_ends_within_the_period_and_its_time_is_reported(make_bench, controller):
-    bench = make_bench(build="cortex-m4", controller=controller, instruction_ns=8 if controller == "salient" else 4)
-    bench.drive.speed_reference_rpm = 600
-    bench.run_for(0.25)
-    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
-    reported = {signal: bench.telemetry[f"DRIVE_DEFERRED.{signal}"].last
-                for signal in ("used_us", "worst_us", "skipped_periods")}
-    print(controller, reported, f"control interrupt: worst {processor(bench, 'worst_us'):g} us")
-    assert processor(bench, "used_us") < reported["used_us"] <= reported["worst_us"]
-    assert processor(bench, "worst_us") < reported["worst_us"] < 1.5 * PERIOD_US
-    assert reported["skipped_periods"] <= 50
-
-
-def held(make_bench, held_us: float) -> Bench:
-    """A drive at rest whose control interrupt begins held_us after its trigger for 0.25 s."""
-    bench = make_bench(build="cortex-m4", controller="traditional", instruction_ns=8)
-    bench.run_for(0.01)
-    bench.rig.interrupt_time_us = held_us
-    bench.run_for(0.25)
-    bench.rig.interrupt_time_us = 0
-    bench.run_for(0.15)
-    return bench
-
-
-@pytest.mark.in_turns
-def test_late_deferred_interrupt_is_counted_and_one_that_does_not_end_is_a_fault(make_bench):
-    bench = held(make_bench, 10)
-    assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == 0
-    control_us = processor(bench, "worst_us") - 10
-    deferred_us = bench.telemetry["DRIVE_DEFERRED.worst_us"].last - processor(bench, "worst_us")
-    assert 0.5 < deferred_us < 4
-
-    # In each period it has four fifths of the time that it takes: two periods.
-    bench = held(make_bench, PERIOD_US - control_us - 0.8 * deferred_us)
-    assert (bench.drive.state, bench.drive.fault) == ("ready", "none")
-    assert bench.telemetry["DRIVE_DEFERRED.skipped_periods"].last == pytest.approx(5000, abs=20)
-    assert PERIOD_US < bench.telemetry["DRIVE_DEFERRED.worst_us"].last < 2 * PERIOD_US
-    assert processor(bench, "late_interrupts") == 0
-
-    bench = held(make_bench, PERIOD_US - control_us - 2 * COUNT_US)
-    assert (bench.drive.state, bench.drive.fault) == ("fault", "interrupt_overrun")
-    assert bench.telemetry["DRIVE_FAULT_CAUSE.state"].last_name == "ready"
+    tuned_us, end_ns = longest_us(changes=40, end_ns=0)
+    untuned_us, _ = longest_us(changes=0, end_ns=end_ns)
+    print(controller, f"longest control interrupt: {untuned_us:.2f} us, tuned {tuned_us:.2f} us")
+    assert tuned_us < untuned_us + 1
