@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from salient.exceptions import read_exceptions
-from salient.experiments import planted
+from salient.experiments import mutants, planted
 from salient.paths import ROOT
 
 FILE = Path("firmware") / "requirements.toml"
@@ -193,7 +193,7 @@ def checkers(root: Path = ROOT) -> list[Marked]:
             for file, text in _files(root, (str(CHECKERS),), (".c",)) for marked in in_c(file, text)]
 
 
-def _changed(root: Path, marked: list[Marked]) -> dict[tuple[str, str], tuple[str, ...]]:
+def _changed(marked: list[Marked]) -> dict[tuple[str, str], tuple[str, ...]]:
     """Names of requirements by file and function."""
     by: dict[tuple[str, str], tuple[str, ...]] = {}
     for each in marked:
@@ -209,24 +209,43 @@ def _owners(file: str, text: str, at: int, by: dict[tuple[str, str], tuple[str, 
     return by.get((file, ""), ())
 
 
-def trace(root: Path = ROOT) -> dict[str, Trace]:
-    """Places of each requirement by its name; unknown ones are left out."""
-    table = read(root)
+@dataclass(frozen=True)
+class Sources:
+    """Marked functions and files, all tests, marked checkers of a checkout."""
+
+    implementations: list[Marked]
+    tests: list[Marked]
+    checkers: list[Marked]
+
+
+def read_sources(root: Path = ROOT) -> Sources:
+    """Reads a checkout's sources."""
+    return Sources(implementations(root), every_test(root), checkers(root))
+
+
+def places(table: Table, sources: Sources) -> dict[str, Trace]:
+    """Functions, tests and checkers of each requirement by its name; unknown ones are left out."""
     traces = {name: Trace() for name in table.requirements}
-    marked = implementations(root)
-    for each in marked:
+    for each in sources.implementations:
         for name in each.names:
             if name in traces:
                 traces[name].functions[each.file].append(each.name)
-    for each in every_test(root):
+    for each in sources.tests:
         for name in each.names:
             if name in traces and each.name != "?":
                 traces[name].tests[each.file].append(each.name)
-    for each in checkers(root):
+    for each in sources.checkers:
         for name in each.names:
             if name in traces:
                 traces[name].checkers.append(each.name)
-    by = _changed(root, marked)
+    return traces
+
+
+def trace(root: Path = ROOT) -> dict[str, Trace]:
+    """All places of each requirement by its name; unknown ones are left out."""
+    table, sources = read(root), read_sources(root)
+    traces = places(table, sources)
+    by = _changed(sources.implementations)
     _add_bugs(root, table, by, traces)
     _add_survivors(root, by, traces)
     return traces
@@ -246,13 +265,13 @@ def _add_bugs(root: Path, table: Table, by: dict[tuple[str, str], tuple[str, ...
 
 
 def _add_survivors(root: Path, by: dict[tuple[str, str], tuple[str, ...]], traces: dict[str, Trace]) -> None:
-    for survivor in read_exceptions(root / "tests" / "mutants.toml"):
-        file, _, line = survivor.partition(": ")
+    known = read_exceptions(root / mutants.KNOWN.relative_to(ROOT))
+    for file in dict.fromkeys(survivor.partition(": ")[0] for survivor in known):
         text = (root / file).read_text(encoding="utf-8")
-        before = line.partition(" [")[0].partition("[")[0].strip()
-        for name in dict.fromkeys(_owners(file, text, text.find(before), by)):
-            if name in traces:
-                traces[name].survivors.append(survivor)
+        for mutant in (each for each in mutants.mutants(file, root) if each.name in known):
+            for name in dict.fromkeys(_owners(file, text, mutant.offset, by)):
+                if name in traces:
+                    traces[name].survivors.append(mutant.name)
 
 
 def _unknown(table: Table, marked: list[Marked]) -> Iterator[str]:
@@ -270,16 +289,15 @@ def _in_safety_part(file: str) -> bool:
 
 def violations(root: Path = ROOT) -> list[str]:
     """One line for each breach of a rule; see above."""
-    table = read(root)
-    tested = every_test(root)
-    lines = list(_unknown(table, [*implementations(root), *tested, *checkers(root)]))
+    table, sources = read(root), read_sources(root)
+    lines = list(_unknown(table, [*sources.implementations, *sources.tests, *sources.checkers]))
     lines += [f"{each.file}:{each.line}: {each.name}: a test of the safety part without a requirement"
-              for each in tested if not each.names and _in_safety_part(each.file)]
-    places = trace(root)
+              for each in sources.tests if not each.names and _in_safety_part(each.file)]
+    found = places(table, sources)
     for name, requirement in table.requirements.items():
-        if not places[name].functions:
+        if not found[name].functions:
             lines.append(f"{FILE}: {name}: no function implements it")
-        if not places[name].tests:
+        if not found[name].tests:
             lines.append(f"{FILE}: {name}: no test")
         lines += [f"{FILE}: {name}: {hazard}: no hazard of the file" for hazard in requirement.hazards
                   if hazard not in table.hazards]

@@ -115,9 +115,10 @@ def _changes(line: str) -> Iterator[tuple[int, str, str]]:
                 yield at, old, new[old]
 
 
-def mutants(file: str) -> list[Mutant]:
-    """All of a source, in its order. Names are the changes', with a number where a line repeats itself."""
-    text = (ROOT / file).read_text(encoding="utf-8")
+def mutants(file: str, root: Path | None = None) -> list[Mutant]:
+    """All of a source of a checkout (ROOT), in its order. Names are the changes', with a number where a line repeats
+    itself."""
+    text = ((root or ROOT) / file).read_text(encoding="utf-8")
     offset, found, names = 0, [], Counter[str]()
     for line in _code(text).split("\n"):
         for at, old, new in _changes(line):
