@@ -10,7 +10,7 @@ from salient.bus.signals import drive_database
 from salient.dbc import attributes
 from salient.machine.path import machine_path
 from salient.paths import MACHINES
-from salient.tab.variables import factors_of, variables_data
+from salient.tab.variables import factors, variables_data
 from salient.view.description import description
 
 _MACHINE_DEPENDENT = ("factor", "offset", "minimum", "maximum")
@@ -43,8 +43,8 @@ def machine_data(machines: list[str]) -> dict[str, Any]:
         "machines": {
             machine_path(name).stem: {
                 "machine": _rounded(each["machine"]), "database_hash": each["database_hash"],
-                "signals": _different(first["databases"], each["databases"]), "factors": factors_of(name),
-            } for name, each in zip(machines, found, strict=True)
+                "signals": _different(first["databases"], each["databases"]), "factors": of_kinds,
+            } for name, each, of_kinds in zip(machines, found, factors(machines), strict=True)
         },
     }
 

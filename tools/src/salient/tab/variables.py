@@ -33,11 +33,11 @@ def variables_data() -> dict[str, Any]:
     }
 
 
-def factors_of(machine: str) -> list[float]:
-    """Factors of the kinds of variables_data, with the exponents of a machine."""
-    of_machine = _listed(Variables(WASM_BUILD, machine))
-    kinds = _kinds(_listed(Variables(WASM_BUILD)))
-    return [of_machine[first].factor for first in kinds.values()]
+def factors(machines: Iterable[str]) -> list[list[float]]:
+    """For each machine the factors of the kinds of variables_data, by its exponents."""
+    firsts = _kinds(_listed(Variables(WASM_BUILD))).values()
+    of_machines = [_listed(Variables(WASM_BUILD, machine)) for machine in machines]
+    return [[listed[first].factor for first in firsts] for listed in of_machines]
 
 
 def _listed(variables: Variables) -> list[Quantity]:
