@@ -271,7 +271,7 @@ void fdcan_event(void) {
         return;
     }
     if (!loops_back()) {
-        return; /* nobody acknowledges */
+        return; /* no node acknowledges */
     }
     const unsigned buffer = can.buffer;
     const fdcan_frame_t frame = frame_of(buffer);

@@ -37,7 +37,7 @@ exec chroot "$1" sh -c "cd /$2 && $3"
 
 
 def prepare(release: str, root: Path) -> None:
-    """Makes the chroot where there is none, with the files of the host that it needs."""
+    """Makes the chroot unless it exists, with the files of the host that it needs."""
     if not (root / "etc" / "debian_version").exists():
         subprocess.run(["debootstrap", "--variant=minbase", f"--include={PACKAGES}", release, root], check=True)
     for name in filter(os.path.exists, OF_HOST):

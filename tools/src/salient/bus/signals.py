@@ -281,7 +281,7 @@ class FrameKeys:
         self.of_any_source = frozenset(self._groups.values())
 
     def find(self, identifier: int, is_extended: bool) -> FrameKey:
-        """The key of the message of an identifier, itself where there is none."""
+        """The key of the message of an identifier; itself without such a message."""
         key = identifier, is_extended
         if not is_extended or not self._groups or key in self.exact:
             return key
