@@ -14,6 +14,7 @@ A formula stays a formula, of other keys. A map is read at the knots of its mode
 from __future__ import annotations
 
 import math
+import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -100,15 +101,22 @@ def wrong_file(right: Path, fault: Fault, name: str, folder: Path) -> Path | Non
     toml = folder / f"{stem}.toml"
     if any(not path.exists() or path.read_text(encoding="utf-8") != text for path, text in paths.items()):
         folder.mkdir(parents=True, exist_ok=True)
-        for path, text in paths.items():
-            path.write_text(text, encoding="utf-8")
-        try:
-            load_machine(toml)
-        except MachineError:
-            for path in paths:
-                path.unlink()
-            raise
+        _put_in_place(texts, toml)
     return toml
+
+
+def _put_in_place(texts: dict[str, str], toml: Path) -> None:
+    """The files, whole and taken by the loader, beside the machine file: another process that reads or writes the same
+    ones never sees half of one. MachineError: nothing is there."""
+    with tempfile.TemporaryDirectory(dir=toml.parent) as temporary:
+        for file, text in texts.items():
+            (Path(temporary) / file).write_text(text, encoding="utf-8")
+        try:
+            load_machine(Path(temporary) / toml.name)
+        except MachineError as error:
+            raise MachineError(str(error).replace(temporary, str(toml.parent))) from error
+        for file in texts:
+            (Path(temporary) / file).replace(toml.parent / file)
 
 
 @lru_cache(maxsize=16)
