@@ -88,6 +88,20 @@ def _open_lock() -> TextIO:
         return lock
 
 
+def keep_text(path: Path, text: str) -> None:
+    """Writes a file that others may write and read at the same time, where it does not have this text yet: a process
+    sees a whole file or none."""
+    if path.exists() and path.read_text(encoding="utf-8") == text:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
     """Makes the folder of --out, if needed; UsageError when nothing can be written there. removed: patterns of the
     files of an earlier run, which could be taken for the files of one that fails half-way."""

@@ -21,7 +21,7 @@ from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
 from salient.machine.cache import content_key, machine_image
 from salient.machine.path import machine_path
-from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, build_lock, from_root, program
+from salient.paths import BUILD, IS_WHEEL, MACHINES, ROOT, build_lock, from_root, keep_text, program
 
 _BUILDERS = {"host": "any tools/salient command",
              "debug": "cmake --preset debug && cmake --build --preset debug",
@@ -118,9 +118,7 @@ def _board_arguments(config: BenchConfig) -> list[str]:
     elf = build_image(config.machine, clock_mhz=BOARD_CLOCK_MHZ, controller=config.controller, node=config.node,
                       bit_rate=config.bit_rate)
     wiring = BUILD / "stm32g4.wiring"
-    text = "".join(f"{pin.signal} {pin.pin}\n" for pin in read_pins())
-    if not wiring.exists() or wiring.read_text(encoding="utf-8") != text:
-        wiring.write_text(text, encoding="utf-8")
+    keep_text(wiring, "".join(f"{pin.signal} {pin.pin}\n" for pin in read_pins()))
     return [str(elf), "--wiring", str(wiring)]
 
 

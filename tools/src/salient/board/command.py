@@ -69,8 +69,9 @@ def build_image(machine: str, *, clock_mhz: int = 170, controller: str = "salien
     if rest or not 1 <= prescaler <= 512:
         raise UsageError(f"--bit-rate {bit_rate}: the clock of {clock_mhz} MHz makes no such rate; must divide "
                          f"{clock_mhz * 1_000_000 // CAN_QUANTA} into 1 to 512 parts, as 1000000, 500000 or 250000")
-    if shutil.which("cmake") is None:
-        raise UsageError("cmake is missing: install the Debian package cmake")
+    for missing, package in (("cmake", "cmake"), ("arm-none-eabi-gcc", "gcc-arm-none-eabi")):
+        if shutil.which(missing) is None:
+            raise UsageError(f"{missing} is missing: install the Debian package {package}")
     settings = {"SALIENT_MACHINE_FILE": path, "SALIENT_BUILT": BUILD / PRESET, "SALIENT_PYTHON": sys.executable,
                 "SALIENT_BOARD_CLOCK_MHZ": clock_mhz, "SALIENT_BOARD_CAN_BIT_RATE": bit_rate,
                 "SALIENT_BOARD_CONTROLLER": CONTROLLERS.index(controller), "SALIENT_BOARD_NODE": node,

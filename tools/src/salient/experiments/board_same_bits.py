@@ -8,7 +8,6 @@ heating by the background begins then.
 from __future__ import annotations
 
 import hashlib
-import subprocess
 import sys
 import tempfile
 from functools import cache
@@ -17,10 +16,11 @@ from typing import Any
 
 from salient.bench import programs
 from salient.bench.bench import Bench
+from salient.builder import build_preset
 from salient.bus.signals import drive_database
 from salient.config import BOARD_BUILD, BenchConfig
 from salient.errors import RunFailed, UsageError
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, ROOT, build_lock, from_root
 
 _RECORD_STEP_NS = 10_000
 
@@ -31,14 +31,18 @@ Frame = tuple[int, int, bytes]
 @cache
 def programs_of_the_clock(clock_mhz: int) -> Path:
     """Folder of the host executable, and of the model, whose PWM timer has a clock. RunFailed: the build fails."""
-    folder = BUILD / f"host-{clock_mhz}"
-    for command in (["cmake", "--preset", "host", "-B", str(folder), f"-DSALIENT_PWM_CLOCK_MHZ={clock_mhz}",
-                     f"-DSALIENT_PYTHON={sys.executable}"],
-                    ["cmake", "--build", str(folder), "--target", "salient_host", "salient_stm32g4"]):
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise RunFailed(f"{' '.join(command[:2])} fails: {(done.stdout + done.stderr)[-2000:]}")
+    folder = BUILD / f"clock-{clock_mhz}" / "host"
+    log = folder.parent / "build.log"
+    options = (f"-DSALIENT_PWM_CLOCK_MHZ={clock_mhz}", f"-DSALIENT_PYTHON={sys.executable}")
+    with build_lock():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        if not build_preset(ROOT, folder, ("salient_host", "salient_stm32g4"), log, _notice, options):
+            raise RunFailed(f"building the host's program for {clock_mhz} MHz failed: see {from_root(log)}")
     return folder / "bin"
+
+
+def _notice() -> None:
+    print("salient: building the host's program for another clock", file=sys.stderr, flush=True)
 
 
 def pair(clock_mhz: int) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from salient.experiments.compare.every_machine import EXAMPLES, random_files
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine
 from salient.machine.scaling import SPEED_LSB_RPM, scaling_of
-from salient.paths import BUILD, MACHINES
+from salient.paths import BUILD, MACHINES, keep_text
 
 RANDOM = range(10)
 """Numbers of the random machines: 0.1 to 500 N m."""
@@ -28,12 +27,7 @@ def pool_file() -> Path:
     """The machines as salient_campaign reads them (emulator/campaign/main.c)."""
     lines = [pool_line(path) for path in files()]
     path = BUILD / "campaign" / "machines.txt"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = "".join(f"{line}\n" for line in lines)
-    if not path.exists() or path.read_text(encoding="utf-8") != text:
-        temporary = path.with_name(f"{path.name}.{os.getpid()}")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+    keep_text(path, "".join(f"{line}\n" for line in lines))
     return path
 
 

@@ -25,7 +25,7 @@ from salient.machine.drive_data import DriveData, derive
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
 from salient.machine.torque_speed import Source, speed_change_s
-from salient.paths import BUILD, ROOT
+from salient.paths import BUILD, ROOT, keep_text
 
 EXAMPLES = ROOT / "tools" / "examples" / "machines"
 RANDOM = BUILD / "random_machines"
@@ -52,13 +52,9 @@ def machine_files(quick: bool) -> list[Path]:
 
 def random_files(numbers: range) -> list[Path]:
     """Files of random machines, written when they are missing."""
-    RANDOM.mkdir(parents=True, exist_ok=True)
-    files = []
-    for number in numbers:
-        path, text = RANDOM / f"random_{number:02}.toml", random_machine(number)
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
-        files.append(path)
+    files = [RANDOM / f"random_{number:02}.toml" for number in numbers]
+    for path, number in zip(files, numbers, strict=True):
+        keep_text(path, random_machine(number))
     return files
 
 

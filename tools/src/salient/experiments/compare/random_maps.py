@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from salient.paths import BUILD
+from salient.paths import BUILD, keep_text
 
 SEED = 20261127
 COUNT = 20
@@ -98,13 +98,11 @@ def _overlap(angle_deg: np.ndarray, stator_deg: float, rotor_deg: float, fringe_
 
 def random_map_files(numbers: range = range(COUNT)) -> list[Path]:
     """Files of random machines, written when they are missing."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
     files = []
     for number in numbers:
         texts = random_map(number)
         paths = [FOLDER / f"random_map_{number:02}.{suffix}" for suffix in ("toml", "csv")]
         for path, text in zip(paths, texts, strict=True):
-            if not path.exists() or path.read_text(encoding="utf-8") != text:
-                path.write_text(text, encoding="utf-8")
+            keep_text(path, text)
         files.append(paths[0])
     return files
