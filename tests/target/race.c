@@ -9,8 +9,7 @@
  * With instruction timing, the timer triggers the control interrupt at any instruction. Without, the deferred step
  * requests it at random places.
  *
- * Every 400 interrupts two frames report counts since start as uint16, little endian: interrupts, torn parameters, torn
- * commands, torn snapshots; control interrupts during a deferred step, torn inputs, torn results, periods skipped.
+ * Every 400 interrupts the program around it is given the counts since the start.
  */
 #include <assert.h>
 #include <stddef.h>
@@ -19,34 +18,17 @@
 #include "drive/drive.h"
 #include "drive/telemetry_collect.h"
 #include "hal_time.h"
-#include "qemu/board.h"
-#include "qemu/hal_qemu.h"
+#include "race.h"
 
-#define FRAME_ID 0x7A0
-#define DEFERRED_FRAME_ID 0x7A1
-#define INTERRUPTS_PER_FRAME 400
-
-/* Symbols of the linker script. */
-extern uint32_t bss_start[], bss_end[];
+#define INTERRUPTS_PER_REPORT 400
 
 const machine_tables_t machine_tables = {.phases = 3, .rotor_poles = 4};
 
-static drive_t drive;
+static const control_state_t *shared; /* the drive's */
 static uint16_t interrupts, torn_parameters, torn_commands, torn_snapshots;
 static uint16_t preemptions, torn_inputs, torn_results;
 static bool computing; /* a deferred step */
 
-/* Sequences of pseudorandom numbers of background and deferred step, 0..511. */
-static uint32_t random_of(uint32_t *sequence) {
-    *sequence = *sequence * UINT32_C(1664525) + UINT32_C(1013904223);
-    return *sequence >> 23;
-}
-
-static void delay(uint32_t rounds) {
-    for (uint32_t i = rounds; i > 0; i--) {
-        __asm__ volatile("");
-    }
-}
 
 static void fill(void *object, size_t bytes, uint32_t number) {
     uint32_t *word = object;
@@ -66,17 +48,18 @@ static uint16_t torn(const void *object, size_t bytes) {
 }
 
 bool configure_rate_allowed(uint32_t control_rate_hz, uint32_t timer_clock_hz) {
-    (void)timer_clock_hz;
-    return control_rate_hz == 40000;
+    (void)control_rate_hz, (void)timer_clock_hz;
+    return true;
 }
 
 /* The first set has the period of the timer in every half word; later sets are also long enough as a timeout. */
 control_parameters_t configure_control(const parameters_t *parameters, const machine_tables_t *tables,
                                        uint32_t control_rate_hz, unsigned encoder_bits, unsigned adc_bits,
                                        uint32_t timer_clock_hz) {
-    (void)timer_clock_hz, (void)tables, (void)control_rate_hz, (void)encoder_bits, (void)adc_bits;
+    (void)tables, (void)encoder_bits, (void)adc_bits;
     static control_parameters_t set;
-    fill(&set, sizeof set, UINT32_C(2500) * 0x10001 + (parameters->revision & 0xFFF) * 0x10001);
+    const uint32_t period_ticks = timer_clock_hz / (2u * control_rate_hz);
+    fill(&set, sizeof set, period_ticks * 0x10001u + (parameters->revision & 0xFFF) * 0x10001);
     return set;
 }
 
@@ -131,6 +114,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
                   const command_t *command, hal_pwm_compare_t *compare) {
     (void)sample, (void)compare;
     interrupts++;
+    shared = state;
     torn_parameters += torn(parameters, offsetof(control_parameters_t, thermal)); /* what configure_control writes */
     torn_commands += torn(command, sizeof *command);
     fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts * 0x10001u);
@@ -155,15 +139,15 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
 #endif
     computing = true;
     const uint32_t number = input->generation;
-    const uint32_t longest = random_of(&sequence); /* most steps take less than a period */
+    const uint32_t longest = race_random(&sequence); /* most steps take less than a period */
     uint32_t *word = (uint32_t *)RESULT(results);
     for (size_t i = 0; i < RESULT_BYTES / sizeof *word; i++) {
         word[i] = number;
-        const uint32_t random = random_of(&sequence);
-        if (board.mailbox.timed) {
-            delay(random < longest / 2 ? random : 0);
+        const uint32_t random = race_random(&sequence);
+        if (race_is_timed()) {
+            race_delay(random < longest / 2 ? random : 0);
         } else if (random < 16) {
-            board_interrupt_pend();
+            race_request();
         }
     }
     results->generation = 0;
@@ -344,24 +328,25 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
                       uint32_t time_us) {
     (void)state;
     static uint16_t reported; /* interrupts */
+    race_round();
     /* As a time just past: a command with it is neither stale nor overdue; as a request none to run. */
     const uint32_t number = (time_us - 0x100u) | 0x80u;
     fill(&comms->command, sizeof comms->command, number);
     objects->parameters->revision++;
     objects->parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] = 50;
     hal_critical_enter(hal);
-    const uint16_t counts[4] = {interrupts, torn_parameters, torn_commands, torn_snapshots};
-    const uint16_t deferred_counts[4] = {preemptions, torn_inputs, torn_results,
-                                         (uint16_t)drive.control.deferred_request.skipped_total};
+    const uint16_t counts[RACE_COUNTS] = {interrupts,
+                                          torn_parameters,
+                                          torn_commands,
+                                          torn_snapshots,
+                                          preemptions,
+                                          torn_inputs,
+                                          torn_results,
+                                          (uint16_t)(shared ? shared->deferred_request.skipped_total : 0)};
     hal_critical_leave(hal);
-    if ((uint16_t)(counts[0] - reported) >= INTERRUPTS_PER_FRAME) {
+    if ((uint16_t)(counts[0] - reported) >= INTERRUPTS_PER_REPORT) {
         reported = counts[0];
-        hal_can_frame_t frame = {.identifier = FRAME_ID, .length = sizeof counts};
-        memcpy(frame.data, counts, sizeof counts);
-        hal_can_transmit(hal, &frame);
-        frame.identifier = DEFERRED_FRAME_ID;
-        memcpy(frame.data, deferred_counts, sizeof deferred_counts);
-        hal_can_transmit(hal, &frame);
+        race_report(hal, counts);
     }
     return true;
 }
@@ -375,30 +360,3 @@ void hal_critical_leave(hal_t *hal) {
     (void)hal;
 }
 #endif
-
-__attribute__((used)) void program_interrupt(void) { /* called by the handler, in assembly */
-    drive_control_interrupt(&drive, &board);
-}
-
-__attribute__((used)) void program_deferred(void) { /* likewise */
-    drive_deferred_interrupt(&drive, &board);
-}
-
-noreturn void program_start(void) {
-    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start)); /* there are no other variables */
-    const drive_config_t config = {.control_rate_hz = board.mailbox.control_rate_hz};
-    const bool started = drive_init(&drive, &board, &config);
-    board_interrupt_enable();
-    doorbell_ring(started ? MAILBOX_STARTED : MAILBOX_REJECTED);
-    uint32_t sequence = 1;
-    while (board.mailbox.event != MAILBOX_EXIT) {
-        if (board.mailbox.event == MAILBOX_INTERRUPT && !board.mailbox.timed) {
-            board_interrupt_pend();
-        } else {
-            drive_background(&drive, &board);
-            delay(random_of(&sequence)); /* the interrupt occurs at all points of a round */
-        }
-        doorbell_ring(MAILBOX_NEXT);
-    }
-    board_exit(board.mailbox.exit_code);
-}
