@@ -29,7 +29,6 @@ static uint16_t interrupts, torn_parameters, torn_commands, torn_snapshots;
 static uint16_t preemptions, torn_inputs, torn_results;
 static bool computing; /* a deferred step */
 
-
 static void fill(void *object, size_t bytes, uint32_t number) {
     uint32_t *word = object;
     for (size_t i = 0; i < bytes / sizeof *word; i++) {
@@ -335,14 +334,9 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
     objects->parameters->revision++;
     objects->parameters->values[PARAMETER_COMMAND_TIMEOUT_MS] = 50;
     hal_critical_enter(hal);
-    const uint16_t counts[RACE_COUNTS] = {interrupts,
-                                          torn_parameters,
-                                          torn_commands,
-                                          torn_snapshots,
-                                          preemptions,
-                                          torn_inputs,
-                                          torn_results,
-                                          (uint16_t)(shared ? shared->deferred_request.skipped_total : 0)};
+    const uint16_t counts[RACE_COUNTS] = {
+        interrupts,  torn_parameters, torn_commands, torn_snapshots,
+        preemptions, torn_inputs,     torn_results,  (uint16_t)(shared ? shared->deferred_request.skipped_total : 0)};
     hal_critical_leave(hal);
     if ((uint16_t)(counts[0] - reported) >= INTERRUPTS_PER_REPORT) {
         reported = counts[0];

@@ -1,6 +1,6 @@
 /* Program of race.c on the board, alone on the model of its part: start.c of its port, which begins a round of the
- * background after an interrupt. Rounds last for up to three control periods, so that the next one comes at all points of
- * a round. After some interrupts the counts are printed at the first stimulus port, and BKPT ends the run. */
+ * background after an interrupt. Rounds last for up to three control periods, so that the next one comes at all points
+ * of a round. After some interrupts the counts are printed at the first stimulus port, and BKPT ends the run. */
 #include "race.h"
 
 #include "hal_watchdog.h"
