@@ -194,6 +194,22 @@ static uint32_t random_number(void *context) {
 
 /* --- Gates --- */
 
+/* The gate drivers of the stage suppress pulses and gaps that are too short, as plant/half_bridge.h has it. */
+static unsigned without_short_pulses(timer_edge_t edges[TIMER_EDGES_MAX], unsigned count, uint64_t to) {
+    uint64_t on = 0;
+    for (unsigned i = 0; i < count; ++i) {
+        const uint64_t from = edges[i].cycle > soc.now ? edges[i].cycle : soc.now;
+        on += edges[i].level ? (i + 1 < count ? edges[i + 1].cycle : to) - from : 0;
+    }
+    const double shortest = board->plant->minimum_pulse_ns * 1e-9 * (double)soc.hclk_hz;
+    const bool short_pulse = (double)on < shortest, short_gap = (double)(to - soc.now - on) < shortest;
+    if (count == 1 || !(short_pulse || short_gap)) {
+        return count;
+    }
+    edges[0].level = !short_pulse;
+    return 1;
+}
+
 /* Edges of one switch; of a pin that is not driven the pull-down resistor keeps the gate off. */
 static unsigned edges_of(int pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_MAX]) {
     bool driven = false;
@@ -205,7 +221,7 @@ static unsigned edges_of(int pin, uint64_t to, timer_edge_t edges[TIMER_EDGES_MA
     if (!driven && gpio_function((unsigned)pin) < 0) {
         edges[0].level = gpio_level((unsigned)pin);
     }
-    return count;
+    return without_short_pulses(edges, count, to);
 }
 
 /* From the start of the period, to the nearest nanosecond, as the plant's timer has it. */
