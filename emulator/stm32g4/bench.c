@@ -1,7 +1,8 @@
 /* SPDX-License-Identifier: GPL-2.0-or-later
  *
  * The rig calls a firmware at the start of each control period. Here that is the trigger of the part's converters: the
- * model advances to it, the gates take the edges of the new period, and the processor runs until it sleeps.
+ * model advances to it, the gates take the edges of the new period, and the processor runs its handlers. The rig's call
+ * of the background is the main program up to its sleep; without that call it hangs where it is.
  * Instructions take time from the reset to the start of TIM1, and none afterwards, as in the host executable.
  */
 #include "stm32g4/bench.h"
@@ -27,10 +28,12 @@ static struct {
     uint64_t start_cycle, origin_ns; /* the same instant in both times */
 } bench;
 
-/* The start takes no time on the host: a free-running counter of the time begins with the bench. */
-static void restart_clocks(void) {
+/* The start takes no time on the host: both counters of the time stand until the bench begins. */
+static void hold_clocks(bool held) {
+    apart_hold_lse(held);
     for (unsigned i = 0; i < TIMERS; ++i) {
         if (timers[i].runs && timers[i].arr == UINT32_MAX && timers[i].psc > 0) {
+            timers[i].held = held;
             timer_restart(&timers[i], 0);
         }
     }
@@ -48,7 +51,9 @@ static void outputs_changed(void *context) {
         bench.start_cycle = soc.now;
         bench.origin_ns = board->time_ns;
         soc.untimed = true;
-        restart_clocks();
+        hold_clocks(false);
+    } else if (!bench.started) {
+        hold_clocks(true);
     }
 }
 
@@ -91,6 +96,14 @@ static void follow_watchdog(void) {
     soc_schedule(EVENT_IWDG, SOC_NEVER); /* the rig resets */
 }
 
+static void stopped(void) {
+    if (soc.reset_request || cpu.exited) {
+        soc_violation("the program has ended or reset itself");
+    }
+    fdcan_refresh();
+    follow_watchdog();
+}
+
 static void control_interrupt(void *context) {
     (void)context;
     const uint64_t now = cycle_of(board->time_ns);
@@ -104,20 +117,18 @@ static void control_interrupt(void *context) {
     bench_io_gates(now + period_cycles());
     bench.outputs_changed = false;
     bench_io_receive();
-    cpu_run(SOC_NEVER, true);
-    if (soc.reset_request || cpu.exited) {
-        soc_violation("the program has ended or reset itself");
-    }
+    cpu_run_handlers();
     if (bench.outputs_changed) {
         bench_io_gates(now + period_cycles());
     }
-    fdcan_refresh();
     board->renewed = true; /* the part has a break of its own for that */
-    follow_watchdog();
+    stopped();
 }
 
 static void background(void *context) {
-    (void)context; /* it has run */
+    (void)context;
+    cpu_run(SOC_NEVER, true);
+    stopped();
 }
 
 static void restart(void *context) {

@@ -37,7 +37,7 @@ static struct {
     bool runs, unlocked;
     uint32_t reload; /* of the last refresh */
     uint64_t expires_ns;
-    bool counts;
+    bool counts, held; /* held: the counter stands */
     double counts_from_ns, at_start, ratio;
     apart_random_t random;
     void *random_context;
@@ -98,13 +98,19 @@ static double lptim_hz(void) {
 
 static double lptim_ticks(void) {
     const double elapsed_ns = (double)soc_ns(soc.now) - apart.counts_from_ns;
-    return apart.at_start + (apart.counts ? elapsed_ns * lptim_hz() / NS_PER_S : 0.0);
+    return apart.at_start + (apart.counts && !apart.held ? elapsed_ns * lptim_hz() / NS_PER_S : 0.0);
 }
 
 void apart_set_lse_ratio(double ratio) {
     apart.at_start = lptim_ticks();
     apart.counts_from_ns = (double)soc_ns(soc.now);
     apart.ratio = ratio;
+}
+
+void apart_hold_lse(bool held) {
+    apart.at_start = lptim_ticks();
+    apart.counts_from_ns = (double)soc_ns(soc.now);
+    apart.held = held;
 }
 
 static bool random_ready(void) {

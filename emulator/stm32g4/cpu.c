@@ -290,6 +290,18 @@ void cpu_run(uint64_t end, bool to_sleep) {
     }
 }
 
+void cpu_run_handlers(void) {
+    until = SOC_NEVER;
+    at_instant = 0;
+    while (!cpu.exited && !soc.reset_request && (candidate() || cpu_exception())) {
+        if (candidate()) {
+            take_exceptions(false);
+        } else {
+            execute();
+        }
+    }
+}
+
 void cpu_stall(uint64_t to) {
     cost = to > soc.now ? (unsigned)(to - soc.now) : 0;
 }

@@ -38,6 +38,9 @@ void cpu_reset(void);
 /* Runs until the cycle, BKPT, or, with `to_sleep`, until the processor sleeps with nothing to wake it. */
 void cpu_run(uint64_t end, bool to_sleep);
 
+/* Runs the handlers of what is pending, and of what they pend, up to the return to the main program. */
+void cpu_run_handlers(void);
+
 /* A word of bank 1 has a double error from now on. */
 void cpu_tear(uint32_t address);
 

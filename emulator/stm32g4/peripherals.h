@@ -114,5 +114,6 @@ uint64_t apart_watchdog_expires_ns(void); /* SOC_NEVER: it does not run */
 typedef uint32_t (*apart_random_t)(void *context);
 void apart_set_random(apart_random_t random, void *context);
 void apart_set_lse_ratio(double ratio); /* 1: exact */
+void apart_hold_lse(bool held);         /* its counter stands */
 
 #endif

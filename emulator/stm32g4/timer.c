@@ -31,7 +31,7 @@ uint64_t timer_period(const tim_t *timer) {
 }
 
 uint64_t timer_place(const tim_t *timer, uint64_t cycle) {
-    const uint64_t place = timer->place + (timer->runs ? (cycle - timer->at) / timer->tick : 0);
+    const uint64_t place = timer->place + (timer->runs && !timer->held ? (cycle - timer->at) / timer->tick : 0);
     const uint64_t period = timer_period(timer);
     return place > period ? period : place;
 }

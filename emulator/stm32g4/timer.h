@@ -70,6 +70,7 @@ typedef struct {
 typedef struct {
     const timer_facts_t *facts;
     bool runs;
+    bool held;      /* runs, and does not count: a bench whose time has not begun */
     uint64_t at;    /* cycle at which the counter was at the place */
     uint64_t place; /* ticks from the start of the period */
     uint64_t tick;  /* cycles of HCLK */

@@ -62,10 +62,10 @@ static noreturn void run(void) {
     const bool started = drive_init(&drive, &board, &config);
     board_interrupts_enable(&board);
     for (;;) {
+        __asm__ volatile("wfi" ::: "memory"); /* the next period's interrupt is the longest wait */
         if (started) {
             drive_background(&drive, &board);
         }
-        __asm__ volatile("wfi" ::: "memory"); /* the next period's interrupt is the longest wait */
     }
 }
 

@@ -14,7 +14,7 @@ from test_same_bits import load_step_150, start_600
 from salient.bench import programs
 from salient.bench.drive import DriveError
 from salient.config import CONTROLLERS
-from salient.experiments.board_same_bits import after_the_first, pair
+from salient.experiments.board_same_bits import pair
 
 CLOCKS = (programs.BOARD_CLOCK_MHZ, pytest.param(170, marks=pytest.mark.in_turns))
 """Clocks of the processor and the PWM timer: whole nanoseconds a tick, and the board's own, a tick of 5.88 ns."""
@@ -36,7 +36,7 @@ def test_image_and_host_agree_in_frames_and_true_state(make_bench, monkeypatch, 
         bench.close()
         made.append((frames, recording.read_bytes(), speed_rpm))
     host, image = made
-    expected, got = (after_the_first(frames) for frames, *_ in made)
+    expected, got = (frames for frames, *_ in made)
     assert host[2] > 100.0
     assert image[1] == host[1], "true state"
     assert len(expected) > 2000
