@@ -63,7 +63,7 @@ def board_hashes(seed: int) -> dict[str, Any]:
     """Hashes of a seed of the campaign on both; left_out: why the board has no such machine. Control rate and encoder
     are the machine's, which the image has."""
     described = world(seed)
-    made: dict[str, Any] = {"seed": seed, "target": BOARD_BUILD}
+    made: dict[str, Any] = {"seed": seed, "target": BOARD_BUILD, "virtual_us": described["duration_us"]}
     with tempfile.TemporaryDirectory(prefix="salient-") as temporary:
         run_world(seed, modelled(described), frames=Path(temporary) / "frames")
         lines = (Path(temporary) / "frames").read_text(encoding="ascii").rpartition("\n")[0].splitlines()

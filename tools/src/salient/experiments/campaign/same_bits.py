@@ -62,8 +62,11 @@ def main(arguments: list[str]) -> int:
     results = [result for _, result in run(tasks, hashes, options.out, jobs=options.jobs)]
     left_out = sorted(result["seed"] for result in results if "left_out" in result)
     different = sorted(result["seed"] for result in results if not equal(result))
-    note = {"first": first, "seeds": seeds, "target": target, "commit": commit(), "program_and_machines": digest(),
-            "different": different, **({"left_out": left_out} if target == BOARD_BUILD else {})}
+    note: dict[str, Any] = {"first": first, "seeds": seeds, "target": target, "commit": commit(),
+                            "program_and_machines": digest(), "different": different}
+    if target == BOARD_BUILD:
+        virtual_us = sum(result["virtual_us"] for result in results if "left_out" not in result)
+        note |= {"left_out": left_out, "virtual_s": round(1e-6 * virtual_us, 3)}
     out: Path = options.out
     (out / SUMMARY).write_text(json.dumps(note, indent=2) + "\n", encoding="utf-8")
     where = "on the host of its clock" if target == BOARD_BUILD else "run twice on the host, on the bench"
