@@ -28,6 +28,7 @@ from salient.experiments.scenario import LoadStep, Record, SpeedStep, run_all
 from salient.identify.command import TELEMETRY_PERIOD_MS, identify
 from salient.identify.result import Result, machine_text, write_machine
 from salient.machine.cache import bench_config
+from salient.machine.drive_data import DriveData
 from salient.machine.file import Machine, load_machine
 from salient.machine.path import machine_path, stated_conditions
 from salient.machine.scaling import scaling_of
@@ -79,19 +80,10 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     config = bench_config({"machine": str(plate), "true_machine": str(path), "controller": "salient",
                            "telemetry_period_ms": TELEMETRY_PERIOD_MS,
                            **({"encoder_bits": int(condition["bits"])} if "bits" in condition else {})})
-    lsb_A = data.adc_current_A / 4096.0
     with tempfile.TemporaryDirectory() as socket:
         bench = Bench(config, f"unix:{socket}/bus")
         try:
-            settings = {"current_noise_A": condition.get("noise_lsb", 0.0) * lsb_A,
-                        "current_sensor_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
-                        "encoder_eccentricity_deg": condition.get("encoder_eccentricity_deg", 0.0),
-                        "load_torque_Nm": condition.get("load", 0.0) * data.torque_rated_Nm}
-            for name, value in settings.items():
-                if value:
-                    setattr(bench.rig, name, value)
-            if condition.get("coulomb"):
-                bench.fault("coulomb_friction", torque_Nm=condition["coulomb"] * data.torque_rated_Nm)
+            disturb(bench, condition, data)
             result = identify(bench, machine, _BINS, _REPEATS, tell)
             time_s = bench.time_s
         finally:
@@ -99,6 +91,20 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     file = folder / f"measured_{path.stem}{label and '_'}{'_'.join(label.replace(',', '').split())}.toml"
     write_machine(result, plate, file)
     return result, file, time_s
+
+
+def disturb(bench: Bench, condition: Mapping[str, float], data: DriveData) -> None:
+    """Sensors, friction and load of a condition; data: of the drive."""
+    lsb_A = data.adc_current_A / 4096.0
+    settings = {"current_noise_A": condition.get("noise_lsb", 0.0) * lsb_A,
+                "current_sensor_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
+                "encoder_eccentricity_deg": condition.get("encoder_eccentricity_deg", 0.0),
+                "load_torque_Nm": condition.get("load", 0.0) * data.torque_rated_Nm}
+    for name, value in settings.items():
+        if value:
+            setattr(bench.rig, name, value)
+    if condition.get("coulomb"):
+        bench.fault("coulomb_friction", torque_Nm=condition["coulomb"] * data.torque_rated_Nm)
 
 
 def errors(found: Machine, true: Machine, result: Result) -> dict[str, float]:

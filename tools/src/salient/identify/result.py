@@ -6,10 +6,13 @@ map's also have the difference to a rougher fit. They do not hold what no pulse 
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
+import shutil
 import tempfile
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +40,8 @@ _NEAR_LIMIT = 0.8
 """Largest current of most pulses, part of the limit, from which the map goes to it; else it ends there."""
 _EVENINGS = 6
 """Means over neighbouring currents until the loader's curve through the points rises everywhere."""
+_DIGEST = 8
+"""Digits of a map's content in the name of its file."""
 _MODEL_PART = 0.008
 """Part by which inertia and friction are wrong without any noise (salient.experiments.identified); cause not known."""
 NOT_OBSERVABLE = (
@@ -198,33 +203,53 @@ def _warnings(found: Findings, fit: Fit) -> list[str]:
 
 # --- the machine file ------------------------------------------------------------------------------------------------
 
-def write_machine(result: Result, plate: Path, path: Path) -> Machine:
+def write_machine(result: Result, plate: Path, path: Path,
+                  page: Callable[[Machine, Path], None] = lambda _, __: None) -> Machine:
     """Writes the machine file with its map beside it: motor by the result, board and ratings by the name plate's file.
-    Returns it as the loader reads it. IdentifyError: the loader refuses it, by its reason."""
+    page: writes the page of the machine to a path, which then has the file's name with .html. Returns the machine as
+    the loader reads it. IdentifyError: the loader refuses it, by its reason.
+
+    The map has a name by its content, and the machine file is replaced in one step after it: whatever ends this
+    process, the file that is there is the old one or the new one, with its own map. What is left by a process that was
+    killed here is removed by the next one."""
     machine = load_machine(plate)
     data = scaling_of(plate, machine).data
     board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
-    text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine, board, path)
-    table = path.with_suffix(".csv")
+    of_plate = tomllib.loads(plate.read_text(encoding="utf-8-sig"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # both files come into their place whole, or none does
+    for left in path.parent.glob(f"{_staging(path)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=_staging(path)) as folder:
         staged = Path(folder) / path.name
-        staged.write_text(text, encoding="utf-8")
         flux_Wb = result.flux_Wb
         for evenings in range(_EVENINGS + 1):
-            staged.with_suffix(".csv").write_text(_map_text(result, flux_Wb), encoding="utf-8")
+            rows = _map_text(result, flux_Wb)
+            table = path.with_name(f"{path.stem}_{hashlib.sha256(rows.encode()).hexdigest()[:_DIGEST]}.csv")
+            staged.with_name(table.name).write_text(rows, encoding="utf-8")
+            staged.write_text(_text(result, of_plate, machine, board, path.stem, table.name), encoding="utf-8")
             try:
-                load_machine(staged)
-                scaling_of(path, load_machine(staged))
+                found = load_machine(staged)
+                scaling_of(path, found)
                 break
             except MachineError as error:
                 if evenings == _EVENINGS:
                     reason = str(error).removeprefix(f"{staged}: ")
                     raise IdentifyError(f"the measured machine is refused: {reason}") from None
             flux_Wb = evened(flux_Wb)
-        staged.with_suffix(".csv").replace(table)
+        page(found, staged.with_suffix(".html"))
+        staged.with_name(table.name).replace(table)
         staged.replace(path)
+        if staged.with_suffix(".html").exists():
+            staged.with_suffix(".html").replace(path.with_suffix(".html"))
+    for other in path.parent.glob(f"{path.stem}_*.csv"):
+        if other != table and re.fullmatch(f"[0-9a-f]{{{_DIGEST}}}", other.stem.removeprefix(f"{path.stem}_")):
+            other.unlink(missing_ok=True)
     return load_machine(path)
+
+
+def _staging(path: Path) -> str:
+    """Begin of the name of the folder in which a machine file is written."""
+    return f".{path.name}."
 
 
 def _map_text(result: Result, flux_Wb: np.ndarray) -> str:
@@ -241,7 +266,8 @@ def evened(flux_Wb: np.ndarray) -> np.ndarray:
     return np.asarray(np.cumsum((padded[:, :-2] + 2.0 * padded[:, 1:-1] + padded[:, 2:]) / 4.0, axis=1))
 
 
-def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:
+def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], name: str,
+          table: str) -> str:
     fit, shaft = result.fit, result.shaft
     converter = dict(plate.get("converter", {}))
     of_devices = sum(machine.converter.get(name, 0.0) for name in ("switch_resistance_ohm", "diode_resistance_ohm"))
@@ -258,7 +284,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         "winding": {"resistance_ohm": float(f"{resistance:.6g}")},
         "mechanics": {"inertia_kg_m2": float(f"{shaft.inertia[0]:.6g}"),
                       "friction_Nm_s": float(f"{max(shaft.friction[0], 0.0):.6g}")},
-        "magnetics": {"form": "map", "file": path.with_suffix(".csv").name},
+        "magnetics": {"form": "map", "file": table},
         "converter": converter,
         **{name: plate[name] for name in ("dc_link", "thermal") if name in plate},
         "drive": drive,
@@ -266,7 +292,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
     if plate.get("drive", {}).get("parameters"):
         tables["drive.parameters"] = plate["drive"]["parameters"]
     return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
-                        path.stem, tables)
+                        name, tables)
 
 
 def _downwards(value: float) -> float:
