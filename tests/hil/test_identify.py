@@ -77,7 +77,7 @@ def test_the_machine_is_found_and_the_name_plate_s_magnetics_are_not_used(identi
 
 
 @pytest.mark.in_turns
-@pytest.mark.parametrize("condition", ["17 bits", "17 bits, load"])
+@pytest.mark.parametrize("condition", ["17 bits", "17 bits, load", "17 bits, eddy 1 mS"])
 def test_noise_friction_eccentricity_and_a_load_change_the_result_little(tmp_path, condition):
     """Noise of 2 LSB, offsets, 0.05 degrees of eccentricity, Coulomb friction of 2 %, load of 20 % of rated torque."""
     path = machine_path("saturating")
@@ -88,6 +88,9 @@ def test_noise_friction_eccentricity_and_a_load_change_the_result_little(tmp_pat
         assert 1e-6 < abs(found[name]) < most, name
     assert 95.0 < found["peak"] <= 105.0
     assert 5.0 < time_s < 30.0
+    conductance_S = CONDITIONS[condition].get("eddy_S", 0.0)
+    assert found["eddy_mS"] == pytest.approx(1e3 * conductance_S, abs=0.02)
+    assert load_machine(file).circuit["eddy_conductance_S"] == pytest.approx(conductance_S, abs=2e-5)
 
 
 def test_only_one_phase_carries_current_and_all_are_off_at_the_end(identifying):

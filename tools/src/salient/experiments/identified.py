@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import sys
 import tempfile
 import tomllib
@@ -41,8 +42,12 @@ CONDITIONS: Mapping[str, Mapping[str, float]] = {
     "14 bits": {**_SENSORS, "bits": 14},
     "load": {"load": 0.2},
     "17 bits, load": {**_SENSORS, "load": 0.2},
+    "eddy 1 mS": {"eddy_S": 1e-3},
+    "eddy 2 mS": {"eddy_S": 2e-3},
+    "17 bits, eddy 1 mS": {**_SENSORS, "eddy_S": 1e-3},
 }
-"""Noise and offset of the currents in LSB of the converter, Coulomb friction and load as parts of the rated torque."""
+"""Noise and offset of the currents in LSB of the converter, Coulomb friction and load as parts of the rated torque;
+conductance of the iron."""
 STEP_RPM, LOAD_NM, START_RPM = 150.0, 8.0, 600.0
 _BINS, _REPEATS = 36, 2
 
@@ -77,6 +82,8 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     plate = plate_of(path, folder)
     machine = load_machine(plate)
     data = scaling_of(path, load_machine(path)).data
+    if "eddy_S" in condition:
+        path = _with_eddy_currents(path, condition["eddy_S"], folder)
     config = bench_config({"machine": str(plate), "true_machine": str(path), "controller": "salient",
                            "telemetry_period_ms": TELEMETRY_PERIOD_MS,
                            **({"encoder_bits": int(condition["bits"])} if "bits" in condition else {})})
@@ -91,6 +98,18 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     file = folder / f"measured_{path.stem}{label and '_'}{'_'.join(label.replace(',', '').split())}.toml"
     write_machine(result, plate, file)
     return result, file, time_s
+
+
+def _with_eddy_currents(path: Path, conductance_S: float, folder: Path) -> Path:
+    """A machine file with another conductance of its iron, and its map."""
+    other = folder / f"eddy_{1e6 * conductance_S:.0f}" / path.name
+    other.parent.mkdir(parents=True, exist_ok=True)
+    table = tomllib.loads(path.read_text(encoding="utf-8-sig"))["magnetics"].get("file")
+    if table:
+        shutil.copyfile(path.parent / table, other.parent / table)
+    other.write_text(f"{path.read_text(encoding='utf-8-sig')}\n[eddy_current]\nconductance_S = {conductance_S}\n",
+                     encoding="utf-8")
+    return other
 
 
 def disturb(bench: Bench, condition: Mapping[str, float], data: DriveData) -> None:
@@ -124,6 +143,7 @@ def errors(found: Machine, true: Machine, result: Result) -> dict[str, float]:
             "resistance": 100.0 * (found.resistance_ohm / true.resistance_ohm - 1.0),
             "inertia": 100.0 * (found.inertia_kg_m2 / true.inertia_kg_m2 - 1.0),
             "friction": 100.0 * (found.friction_Nm_s / true.friction_Nm_s - 1.0),
+            "eddy_mS": 1e3 * result.fit.conductance_S,
             "peak": 100.0 * float(result.log["current_A"].max()) / result.limit_A}
 
 

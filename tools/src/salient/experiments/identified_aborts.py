@@ -58,9 +58,11 @@ from salient.paths import OUT
 
 SEEDS = 200
 KINDS = ("kill", "silence", "fault", "sto")
-STAGES = {"rest": (0.0, 0.075), "hold": (0.0, 4.5), "drift": (0.0, 1.5), "spin-up": (0.0, 2.5)}
-"""Beginnings of the lines by which an identification tells its stage; times after that, s, one of which is drawn."""
+STAGES = {"rest": 0.075, "hold": 4.5, "drift": 1.5, "spin-up": 1.0, "coasting": 0.9}
+"""Stages of an identification; times up to which an instant is drawn after its begin, s."""
 _TOLD = {"rest": ("rest",), "hold": ("hold", "a load"), "drift": ("drift",), "spin-up": ("spin-up",)}
+"""Beginnings of the lines by which it tells them. Coasting begins with a rest in the spin-up of this length:"""
+_COASTS_NS = 20_000_000
 BINS, REPEATS = 24, 1
 COMMAND_TIMEOUT_S, BACKGROUND_S = 0.05, 0.003
 """Parameter command_timeout_ms, default; passes of the background, and periods, until the switches open."""
@@ -69,7 +71,7 @@ _LOAD_PART, _LOADED = 0.2, 0.3
 _ON_PART, _CURRENT_PART = 0.2, 0.005
 """Part of the power that a gate takes away from the DC link's, and of the limit from which a current counts."""
 _PEAK, _TRIP_PEAK = 1.05, 1.2
-_AFTER_S, _READY_S = 0.25, 1.0
+_AFTER_S, _BRAKED_S = 0.25, 20.0
 _START_RPM, _TURNED_RPM = 300.0, 30.0
 
 
@@ -130,7 +132,7 @@ def drawn(seed: int) -> Abort:
     of = random.Random(seed)
     stage = of.choice(list(STAGES))
     return Abort(seed, of.choice(machines()), of.random() < _LOADED, KINDS[seed % len(KINDS)],
-                 of.randrange(len(FAULTS)), stage, of.uniform(*STAGES[stage]), of.uniform(0.06, 1.2),
+                 of.randrange(len(FAULTS)), stage, of.uniform(0.0, STAGES[stage]), of.uniform(0.06, 1.2),
                  of.choice([(1, 0), (0, 1), (1, 1)]), of.random() < 0.25, of.random() < 0.5)
 
 
@@ -144,21 +146,37 @@ class Client(Session):
     def __init__(self, can: str, machine: str, strike: Callable[[Client], None]) -> None:
         self._strike: Callable[[Client], None] | None = strike
         self._at_ns: int | None = None
-        self._stage = ""
+        self._stage, self._wanted, self._offset_ns = "", "", 0
+        self._rests_ns: int | None = None
         self.place = ""
         self.struck_ns = 0
         super().__init__(can, machine=machine)
 
     def arm(self, stage: str, offset_s: float) -> Callable[[str], None]:
         """What the identification tells its stages to."""
+        self._wanted, self._offset_ns = stage, round(1e9 * offset_s)
+
         def tell(line: str) -> None:
-            self._stage = next((name for name, begins in _TOLD.items() if line.startswith(begins)), self._stage)
-            if self._stage == stage and self._at_ns is None:
-                self._at_ns = self.time_ns + round(1e9 * offset_s)
+            self._enter(next((name for name, begins in _TOLD.items() if line.startswith(begins)), self._stage))
         return tell
+
+    def _enter(self, stage: str) -> None:
+        self._stage = stage
+        if stage == self._wanted and self._at_ns is None:
+            self._at_ns = self.time_ns + self._offset_ns
+
+    def _follow(self) -> None:
+        """Coasting, which is not told."""
+        if self._stage != "spin-up" or self.drive._experiment.kind != "rest":
+            self._rests_ns = None
+        elif self._rests_ns is None:
+            self._rests_ns = self.time_ns
+        elif self.time_ns > self._rests_ns + _COASTS_NS:
+            self._enter("coasting")
 
     def advance_to(self, time_ns: int) -> None:
         """Lets time pass."""
+        self._follow()
         if self._at_ns is not None and self._strike is not None and time_ns >= self._at_ns:
             super().advance_to(max(self._at_ns, self.time_ns))
             strike, self._strike = self._strike, None
@@ -252,7 +270,7 @@ def run_one(abort: Abort) -> dict[str, Any]:
         record = np.load(recording)
     if not struck_ns:
         return {"place": "", "ending": ending, "cause": cause, "off_s": None, "peak": None,
-                "wrong": [] if ending == "not struck" else ["ended before the instant"]}
+                "wrong": []}
     wrong += [] if files == before else [f"files {sorted(set(files.items()) ^ set(before.items()))[:1]}"]
     found, off_s, peak = _physics(abort, record, struck_ns * 1e-9, latched_s, end_s,
                                   data.parameters["current_limit_A"], data.current_trip_A)
@@ -275,6 +293,8 @@ def _judged(abort: Abort, judge: Session, path: Path) -> tuple[list[str], float 
             judge.clear_fault(case.kind, **{name: str(value) for name, value in case.arguments.items()
                                             if name in ("phase", "leg")})
     judge.rig.load_torque_Nm = 0.0
+    judge.rig.held_speed_rpm = 0.0  # a load may have driven it to any speed
+    judge.run_until(lambda: abs(judge.truth["speed_rpm"].last) < 1.0, timeout=_BRAKED_S)
     for speed_rpm in (_TURNED_RPM, 0.0, math.nan):  # an encoder's fault ends when it counts again
         judge.rig.held_speed_rpm = speed_rpm
         judge.run_for(0.05)
@@ -444,6 +464,7 @@ def summary(results: Sequence[tuple[Abort | None, Mapping[str, Any]]]) -> list[s
         late = max((result["off_s"] for result in of if result["off_s"] is not None), default=0.0)
         lines.append(f"{kind}: {len(of)}, gates off after at most {1e3 * late:.2f} ms, "
                      f"{sum(bool(result['wrong']) for result in of)} wrong")
+    lines.append(f"ended before their instant: {sum(abort is not None for abort, _ in results) - len(aborts)}")
     places = Counter(result["place"] for _, result in aborts)
     lines.append("places: " + ", ".join(f"{place} {count}" for place, count in sorted(places.items())))
     return lines

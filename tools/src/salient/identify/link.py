@@ -195,6 +195,12 @@ class Link:
                                 f"{self._session.drive.state}")
         return np.concatenate(parts)
 
+    def interrupts(self, log: np.ndarray) -> bool:
+        """Whether the experiment of these records has ended one with a current, whose flux its pulse then begins
+        with."""
+        before = self.log[:np.searchsorted(self.log["time_us"], log["time_us"][0])][-1:]
+        return bool(np.isin(before["state"], (HOLDS, CHARGES, FREEWHEELS, DISCHARGES)).any())
+
     def rest(self, duration_s: float) -> np.ndarray:
         """All switches off."""
         return self.run(Experiment("rest"), duration_s)

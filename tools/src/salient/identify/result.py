@@ -24,6 +24,7 @@ from salient.identify.fit import Fit
 from salient.identify.link import IdentifyError
 from salient.identify.sequence import Findings
 from salient.identify.shaft import Shaft, shaft_of
+from salient.machine.contradictions import EDDY_TIME_CONSTANT_S
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.scaling import scaling_of
 
@@ -44,13 +45,14 @@ _DIGEST = 8
 """Digits of a map's content in the name of its file."""
 _MODEL_PART = 0.008
 """Part by which inertia and friction are wrong without any noise (salient.experiments.identified); cause not known."""
+CONDUCTANCE = "conductance of the iron for eddy currents"
 NOT_OBSERVABLE = (
     ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
      "pulses would be the same; by a meter in series"),
     ("gain of the DC-link voltage", "scales flux linkage and resistance alike; by a voltmeter"),
     ("drop of a switch less that of a diode", "acts as a change of the DC-link voltage"),
     ("mutual coupling of the phases", "one phase alone carries current in each pulse"),
-    ("eddy currents, hysteresis", "not in the model of the fit; they show as its residual"),
+    ("hysteresis", "not in the model of the fit; it shows as its residual"),
     ("differences of the phases", "the map is one of all phases; their aligned angles are not"),
 )
 
@@ -152,6 +154,7 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
         return _INTERVAL * float(np.std(list(values)))
 
     resistance = half(other.resistance_ohm for other in others)
+    conductance = half(other.conductance_S for other in others)
     inertia = math.hypot(_INTERVAL * shaft.inertia[1], _MODEL_PART * shaft.inertia[0])
     friction = math.hypot(_INTERVAL * shaft.friction[1], _MODEL_PART * shaft.friction[0])
     angle_deg = max(half(math.degrees(other.delta_rad[row]) for other in others) for row in range(len(found.phases)))
@@ -173,6 +176,8 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
                  half(math.degrees(math.hypot(*other.eccentricity_rad)) for other in others), "determined"),
         Quantity("delay of the current sensors", "us", 1e6 * fit.delay_s, half(1e6 * other.delay_s for other in others),
                  "determined"),
+        Quantity(CONDUCTANCE, "S", fit.conductance_S, conductance,
+                 "determined" if abs(fit.conductance_S) > conductance else "within its uncertainty"),
         Quantity("inertia", "kg m^2", shaft.inertia[0], inertia, _verdict(inertia / shaft.inertia[0], _FLAT_INERTIA)),
         Quantity("viscous friction", "N m s", shaft.friction[0], friction,
                  _verdict(friction / max(abs(shaft.friction[0]), 1e-12), 0.1)),
@@ -286,6 +291,7 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
                       "friction_Nm_s": float(f"{max(shaft.friction[0], 0.0):.6g}")},
         "magnetics": {"form": "map", "file": table},
         "converter": converter,
+        **_eddy_current(result),
         **{name: plate[name] for name in ("dc_link", "thermal") if name in plate},
         "drive": drive,
     }
@@ -293,6 +299,16 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         tables["drive.parameters"] = plate["drive"]["parameters"]
     return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
                         name, tables)
+
+
+def _eddy_current(result: Result) -> dict[str, Mapping[str, Any]]:
+    """The table of the file, for the emulator alone; none while the conductance is within its uncertainty, or without
+    effect by the loader's bounds."""
+    found = next(each for each in result.quantities if each.name == CONDUCTANCE)
+    decay_s = found.value * float(result.flux_Wb[-1, 0] / result.current_A[-1, 0])
+    if found.value <= found.half_width or not EDDY_TIME_CONSTANT_S[0] <= decay_s <= EDDY_TIME_CONSTANT_S[1]:
+        return {}
+    return {"eddy_current": {"conductance_S": float(f"{found.value:.4g}")}}
 
 
 def _downwards(value: float) -> float:

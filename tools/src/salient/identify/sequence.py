@@ -51,6 +51,8 @@ _DRIFT_LOADED_S = 0.03
 _PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 0.5, 3, 3.0
 """Electrical periods and pulses of each phase that show the inductances of a turning rotor, at least; at most that
 long."""
+_OFF = 0.4
+"""Largest distance of two phases from a whole number of strokes, strokes."""
 _CLEARER = 4.0
 """Sum of squares of the second best order of the phases by the one of the best, from which that is believed."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
@@ -147,7 +149,7 @@ class Sequence:
                ) -> np.ndarray:
         log = self.link.run(experiment, timeout_s)
         fired = (log["state"] >= CHARGES) & (log["state"] <= RESTS)
-        if keep and fired.any():
+        if keep and fired.any() and not self.link.interrupts(log):
             self.found.pulses.append(Pulse(experiment.phase, log[fired], mapped))
         return log
 
@@ -171,17 +173,19 @@ class Sequence:
             places.append(place)
             self.link.rest(0.01)
             self._resistance(phase)
-        self._order(places)
+        # The first hold may have found the rotor where friction holds it against the phase, opposite to its poles.
+        self._order([places[-1], *places[1:-1]])
         self.found.wired_us = int(self.link.log["time_us"][-1])
 
     def _order(self, places: list[float]) -> None:
         """Positions and order of the phases by where each of them is aligned, rev."""
         stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
-        for phase, place in zip(self.found.phases, places, strict=False):
-            strokes = (place - places[0]) / stroke
+        strokes = [(place - places[0]) / stroke for place in places]
+        for phase, place, each in zip(self.found.phases, places, strokes, strict=True):
             self.found.position[phase] = place
-            self.found.order[phase] = round(strokes) % len(self.found.phases)
-        if sorted(self.found.order.values()) != list(range(len(self.found.phases))):
+            self.found.order[phase] = round(each) % len(self.found.phases)
+        off = max(abs(each - round(each)) for each in strokes)
+        if off > _OFF or sorted(self.found.order.values()) != list(range(len(self.found.phases))):
             raise IdentifyError(f"the phases pull the rotor to {', '.join(f'{360 * place:.2f}' for place in places)} "
                                 f"degrees: not those of {self.found.rotor_poles} rotor poles, or the rotor is blocked")
 
@@ -360,12 +364,13 @@ class Sequence:
                 log = self._push(direction, speed, turn)
                 continue
             self._end_push()
+            had = len(found.pulses)
             if self._load:  # up to the drift speed, and down to it the other way, while the load turns the rotor back
                 window, log = self._measure_falling(counts, star, speed, turn)
             else:
                 window, log = self._measure(counts, star, speed, turn, direction)
             fired = log[log["state"] == CHARGES]
-            if len(fired):
+            if len(fired) and len(found.pulses) > had:
                 phase = int(fired["phase"][0])
                 row = found.phases.index(phase)
                 place = found.electrical(phase, float(fired["turn"][0])) * bins
