@@ -42,7 +42,10 @@ from salient.machine.scaling import scaling_of
 from salient.paths import OUT
 
 SEEDS = 1000
-_LOADED, _OTHER_POLES = 0.25, 0.25
+_LOADED, _OTHER_POLES, _LOAD = 0.25, 0.25, 0.2
+"""Parts of the seeds; load by the rated torque."""
+_CAUGHT_RAD_S2 = 10_000.0 * math.pi / 30.0
+"""A load that turns the rotor faster is not caught before the over-speed (docs/limits.md)."""
 _NEAR = 1.0 / 12.0
 """Of an electrical revolution: largest error of a rough angle."""
 _MAP_BINS = 12
@@ -73,8 +76,10 @@ def drawn(seed: int, machines: Sequence[str]) -> Start:
     machine = load_machine(machine_path(name))
     phases, poles = machine.phases, machine.rotor_poles
     others = [each for each in POLES[phases] if each != poles]
+    rated_Nm = scaling_of(machine_path(name), machine).data.torque_rated_Nm
+    caught = _LOAD * rated_Nm / machine.inertia_kg_m2 < _CAUGHT_RAD_S2
     condition = {"noise_lsb": 2.0, "offset_lsb": of.uniform(0.0, 8.0), "encoder_eccentricity_deg": 0.05,
-                 "coulomb": of.choice((0.0, 0.02)), "load": 0.2 if of.random() < _LOADED else 0.0}
+                 "coulomb": of.choice((0.0, 0.02)), "load": _LOAD if of.random() < _LOADED and caught else 0.0}
     return Start(seed, name, of.uniform(0.0, 360.0), of.uniform(-180.0, 180.0), of.random() < 0.5,
                  tuple(of.sample(range(phases), phases)), of.choice((14, 17)), condition,
                  of.choice(others) if of.random() < _OTHER_POLES else poles)

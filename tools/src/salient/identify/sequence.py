@@ -51,6 +51,8 @@ _DRIFT_LOADED_S = 0.03
 _PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 0.5, 3, 3.0
 """Electrical periods and pulses of each phase that show the inductances of a turning rotor, at least; at most that
 long."""
+_APART = 0.5
+"""Least rotation from where one phase holds the rotor to where the next one does, strokes."""
 _OFF = 0.4
 """Largest distance of two phases from a whole number of strokes, strokes."""
 _CLEARER = 4.0
@@ -163,19 +165,37 @@ class Sequence:
             return
         self.tell(f"hold: each phase pulls the rotor with {HOLD_LEVEL:.0%} of the limit and is damped: order, "
                   "direction, angles")
-        phases = [*self.found.phases, self.found.phases[0]]
+        phases = self.found.phases
+        places = self._hold_each([*phases, phases[0]])
+        # The first hold may have found the rotor where friction holds it against the phase, opposite to its poles.
+        self._order([places[-1], *places[1:-1]])
+        if self._common_strokes(places[1:]) > 1:  # by chance, by the wiring, or fewer poles: in another order
+            count = len(phases)
+            places += self._hold_each([phases[2 * k % count if count % 2 else -k] for k in range(count)])
+            factor = self._common_strokes(places[1:])
+            if factor > 1:
+                raise IdentifyError(f"each phase pulls the rotor by a multiple of {factor} strokes of "
+                                    f"{self.found.rotor_poles} rotor poles: it has fewer")
+        self.found.wired_us = int(self.link.log["time_us"][-1])
+
+    def _hold_each(self, phases: list[int]) -> list[float]:
+        """Where phases hold the rotor, one after the other."""
         places: list[float] = []
+        apart = _APART / len(self.found.phases) / self.found.rotor_poles
         for number, phase in enumerate(phases):
             place, moved = self._settle(phase)
-            if moved < _STILL and number > 0:  # an unstable equilibrium: another phase moves the rotor out of it
+            if moved < apart and number > 0:  # an unstable equilibrium: another phase moves the rotor out of it
                 self.link.run(Experiment("hold", self._other(phases, number), HOLD_LEVEL), 0.05)
                 place, moved = self._settle(phase)
             places.append(place)
             self.link.rest(0.01)
             self._resistance(phase)
-        # The first hold may have found the rotor where friction holds it against the phase, opposite to its poles.
-        self._order([places[-1], *places[1:-1]])
-        self.found.wired_us = int(self.link.log["time_us"][-1])
+        return places
+
+    def _common_strokes(self, places: list[float]) -> int:
+        """Largest number of strokes of which all rotations between places are multiples."""
+        stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
+        return math.gcd(*(round((place - places[0]) / stroke) for place in places[1:]))
 
     def _order(self, places: list[float]) -> None:
         """Positions and order of the phases by where each of them is aligned, rev."""
@@ -264,10 +284,10 @@ class Sequence:
     def _other(phases: list[int], number: int) -> int:
         return next(phase for phase in phases if phase not in (phases[number], phases[number - 1]))
 
-    def _hold(self, phase: int, duration_s: float, centre: float | None) -> np.ndarray:
+    def _hold(self, phase: int, duration_s: float, centre: float | None, level: float = HOLD_LEVEL) -> np.ndarray:
         kind = "hold" if centre is None else "damped"
         angle = 0.0 if centre is None else min(centre % 1.0, 65535 / 65536)
-        return self.link.run(Experiment(kind, phase, HOLD_LEVEL, angle=angle), duration_s)["turn"]
+        return self.link.run(Experiment(kind, phase, level, angle=angle), duration_s)["turn"]
 
     def _settle(self, phase: int) -> tuple[float, float]:
         """Where a phase holds the rotor, and how far that was, rev."""
@@ -282,7 +302,8 @@ class Sequence:
             if np.ptp(turns[len(turns) // 2:]) < quiet:
                 break
             turns = self._hold(phase, max(0.5 * span_s, 0.15), centre_of(turns))
-        turns = self._hold(phase, _HOLD_S, None)  # friction may have stopped it anywhere, with a quarter of the current
+        # Friction may have stopped it anywhere, with a quarter of the current.
+        turns = self._hold(phase, _HOLD_S, None, PUSH_LEVEL)
         if np.ptp(turns) >= quiet:
             return centre_of(turns), moved
         tail = turns[len(turns) // 2:]
