@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from salient.bench.drive import Experiment
-from salient.experiments import identified_aborts
+from salient.experiments import identified_aborts, identified_starts
 from salient.experiments.identified import CONDITIONS, errors, identified
 from salient.identify.command import identify
 from salient.identify.link import HOLD_RECORD_S, IDLE, LOSS_MS, IdentifyError, linked
@@ -174,6 +174,28 @@ def test_a_fault_at_any_instant_ends_them_and_can_be_cleared(identifying, seed):
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.4)
     assert bench.drive.state == "run"
+
+
+BUNDLED = ("finite_element", "linear_cosine", "linear_trapezoid", "saturating")
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("seed", range(1, 25))
+def test_order_direction_and_angles_are_right_from_any_start(seed):
+    """Or the name plate has another number of poles, and is refused."""
+    start = identified_starts.drawn(seed, BUNDLED)
+    poles = load_machine(machine_path(start.machine)).rotor_poles
+    result = identified_starts.run_one(start)
+    assert result["verdict"] == ("right" if start.plate_poles == poles else "refused"), result
+
+
+def test_fewer_poles_than_the_name_plate_s_are_refused(identifying):
+    bench = identifying(initial_angle_deg=20.0)
+    with linked(bench) as link:
+        sequence = Sequence(link, 3, 8, lambda _: None)
+        sequence.probe()
+        with pytest.raises(IdentifyError, match="a multiple of 2 strokes of 8 rotor poles"):
+            sequence.align()
 
 
 @pytest.mark.parametrize("seed", range(1, 9))
