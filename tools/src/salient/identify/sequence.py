@@ -54,7 +54,7 @@ long."""
 _APART = 0.5
 """Least rotation from where one phase holds the rotor to where the next one does, strokes."""
 _OFF = 0.4
-"""Largest distance of two phases from a whole number of strokes, strokes."""
+"""Largest distance of a phase from its place in the order, strokes."""
 _CLEARER = 4.0
 """Sum of squares of the second best order of the phases by the one of the best, from which that is believed."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
@@ -198,14 +198,22 @@ class Sequence:
         return math.gcd(*(round((place - places[0]) / stroke) for place in places[1:]))
 
     def _order(self, places: list[float]) -> None:
-        """Positions and order of the phases by where each of them is aligned, rev."""
-        stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
-        strokes = [(place - places[0]) / stroke for place in places]
-        for phase, place, each in zip(self.found.phases, places, strokes, strict=True):
-            self.found.position[phase] = place
-            self.found.order[phase] = round(each) % len(self.found.phases)
-        off = max(abs(each - round(each)) for each in strokes)
-        if off > _OFF or sorted(self.found.order.values()) != list(range(len(self.found.phases))):
+        """Positions and order of the phases by where each of them is aligned, rev: the order that explains all places
+        best, whose common origin has the mean of their errors, which friction makes."""
+        count = len(self.found.phases)
+        stroke = 1.0 / (count * self.found.rotor_poles)
+        strokes = (np.array(places) - places[0]) / stroke
+        fits = []
+        for others in itertools.permutations(range(1, count)):
+            left = 2.0 * math.pi * (strokes - [0, *others]) / count
+            origin = float(np.angle(np.exp(1j * left).mean()))
+            off = float(np.abs(np.angle(np.exp(1j * (left - origin)))).max())
+            fits.append((off * count / (2.0 * math.pi), origin * count / (2.0 * math.pi), (0, *others)))
+        off, origin, order = min(fits)
+        for phase, each in zip(self.found.phases, order, strict=True):
+            self.found.position[phase] = places[0] + (origin + each) * stroke
+            self.found.order[phase] = each
+        if off > _OFF:
             raise IdentifyError(f"the phases pull the rotor to {', '.join(f'{360 * place:.2f}' for place in places)} "
                                 f"degrees: not those of {self.found.rotor_poles} rotor poles, or the rotor is blocked")
 
