@@ -153,7 +153,7 @@ class Client(Session):
         super().__init__(can, machine=machine)
 
     def arm(self, stage: str, offset_s: float) -> Callable[[str], None]:
-        """What the identification tells its stages to."""
+        """A function that takes the lines by which the identification tells its stages."""
         self._wanted, self._offset_ns = stage, round(1e9 * offset_s)
 
         def tell(line: str) -> None:
@@ -192,7 +192,7 @@ class Client(Session):
 
 
 def strike_of(abort: Abort, note: Path) -> Callable[[Client], None]:
-    """What befalls the client, or its drive. note: gets the instant, before a process dies."""
+    """The end of the client, or of its drive. note: gets the instant, before a process dies."""
     def strike(client: Client) -> None:
         note.write_text(json.dumps([client.struck_ns, client.place]), encoding="utf-8")
         if abort.kind == "kill":
@@ -347,8 +347,8 @@ def gates_on(record: np.ndarray, least_A: float) -> np.ndarray:
 
 def _physics(abort: Abort, record: np.ndarray, struck_s: float, latched_s: float | None, end_s: float, limit_A: float,
              trip_A: float) -> tuple[list[str], float | None, float]:
-    """What is wrong with the true state, time from the instant to the last gate that was on, and the largest current by
-    its bound."""
+    """Violations by the true state, time from the instant to the last gate that was on, and the largest current by its
+    bound."""
     time_s = np.asarray(record["time_s"])
     until = int(np.searchsorted(time_s, end_s + _AFTER_S))  # before the judge does anything
     record, time_s = record[:until], time_s[:until]

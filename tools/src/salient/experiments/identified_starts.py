@@ -47,7 +47,7 @@ _LOADED, _OTHER_POLES, _LOAD = 0.25, 0.25, 0.2
 _CAUGHT_RAD_S2 = 10_000.0 * math.pi / 30.0
 """A load that turns the rotor faster is not caught before the over-speed (docs/limits.md)."""
 _NEAR = 1.0 / 12.0
-"""Of an electrical revolution: largest error of a rough angle."""
+"""Largest error of a rough angle, of an electrical revolution."""
 _MAP_BINS = 12
 POLES = {3: (2, 4, 8, 10, 14, 16, 20, 22, 28), 4: (2, 6, 10, 14, 18), 5: (2, 4, 6, 8, 12, 14, 16), 6: (2, 5, 7, 10, 14)}
 """Rotor poles of machines, by the number of phases: of wrong name plates."""
@@ -119,7 +119,7 @@ class Wired:
 
 
 def run_one(start: Start) -> dict[str, Any]:
-    """What is found, by its error; executed by a worker. verdict: right, wrong or refused."""
+    """The findings by their error; executed by a worker. verdict: right, wrong or refused."""
     path = machine_path(start.machine)
     machine = load_machine(path)
     data = scaling_of(path, machine).data

@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
 def measure(session: Session, plate: Path, out: Path, bins: int, repeats: int, print_line: Callable[[str], None]
             ) -> Result:
     """identify, and its files: the machine file `out`, its map and its page. They are written at the end: until then,
-    and when there is no result, those of an earlier run stay."""
+    and when there is no result, the files of an earlier run stay."""
     machine = load_machine(plate)
     result = identify(session, machine, bins, repeats, print_line)
     write_machine(result, plate, out, lambda found, page: write_report(result, found, machine, page))

@@ -113,6 +113,8 @@ class Sequence:
         """Acceleration by a load that turns the rotor, rev/s^2; 0 of a rotor that stays where it is."""
         self._wound: dict[int, np.ndarray] = {}
         """Records of the pulses that showed the windings, by phase."""
+        self._missed: dict[tuple[int, int], int] = {}
+        """Successive pulses of a phase from a window that the rotor has not reached."""
         self._pushed: int | None = None
         """Phase of the last push, whose current may not have ended."""
         self._from, self._unmoved = 0.0, 0
@@ -428,8 +430,11 @@ class Sequence:
         if choice is None:
             raise IdentifyError("no phase can move the rotor")
         row, window, arrival_s = choice
-        return window, self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
-                                   timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
+        log = self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
+                          timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
+        fired = bool((log["state"] == CHARGES).any())
+        self._missed[row, window] = 0 if fired else self._missed.get((row, window), 0) + 1
+        return window, log
 
     def _measure_falling(self, counts: np.ndarray, star: float, speed: float, turn: float) -> tuple[int, np.ndarray]:
         """As _measure, of a rotor that a load turns back: near standstill at once, of the phase whose present window
@@ -484,7 +489,7 @@ class Sequence:
                 arrival_s = ahead / found.rotor_poles / max(abs(speed), _SLOW * star)
                 # The variance of a mean of n pulses falls by about 1 / n^2 with one more.
                 had = (1.0 + of_window[min(window, bins - 1 - window)]) ** 2 * (1.0 + counts[row, window])
-                cost = (arrival_s + _PULSE_S) * had
+                cost = (arrival_s + _PULSE_S) * had * (1.0 + self._missed.get((row, window), 0)) ** 2
                 if best is None or cost < best[0]:
                     best = (cost, row, window, arrival_s)
         return None if best is None else best[1:]
