@@ -48,7 +48,7 @@ _CAUGHT_RAD_S2 = 10_000.0 * math.pi / 30.0
 """A load that turns the rotor faster is not caught before the over-speed (docs/limits.md)."""
 _NEAR = 1.0 / 12.0
 """Largest error of a rough angle, of an electrical revolution."""
-_MAP_BINS = 12
+_MAP_BINS, _STANDS_RPM = 12, 1e-3
 POLES = {3: (2, 4, 8, 10, 14, 16, 20, 22, 28), 4: (2, 6, 10, 14, 18), 5: (2, 4, 6, 8, 12, 14, 16), 6: (2, 5, 7, 10, 14)}
 """Rotor poles of machines, by the number of phases: of wrong name plates."""
 
@@ -157,12 +157,12 @@ def _judged(start: Start, rotor_poles: int, found: Findings, bench: Bench, link:
     sign, phases = -1 if start.reversed else 1, len(start.wiring)
     wanted = [sign * (start.wiring[phase] - start.wiring[0]) % phases for phase in range(phases)]
     order = [found.order[phase] for phase in range(phases)]
-    angle = bench.truth["rotor_angle_deg"]
-    log = link.log
-    at_s = float(angle.time_s[-1])
-    time_s = (log["time_us"] - log["time_us"][-1]) * 1e-6 + bench.time_s
-    turn = float(np.interp(at_s, time_s, log["turn"]))
-    zero = turn - sign * float(angle.last) / 360.0
+    bench.rig.held_speed_rpm = 0.0  # encoder and true angle are read at rest
+    while abs(bench.truth["speed_rpm"].last) > _STANDS_RPM:
+        link.rest(0.01)
+    turn = float(link.rest(0.01)["turn"][-1])
+    zero = turn - sign * float(bench.truth["rotor_angle_deg"].last) / 360.0
+    bench.rig.held_speed_rpm = math.nan
     errors = [math.remainder(rotor_poles * (found.position[phase] - zero) - sign * start.wiring[phase] / phases, 1.0)
               for phase in range(phases)]
     error = max(map(abs, errors))
