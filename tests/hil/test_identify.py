@@ -7,12 +7,14 @@ import random
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from salient.bench.drive import Experiment
+from salient.experiments import identified_aborts, identified_starts
 from salient.experiments.identified import CONDITIONS, errors, identified
 from salient.identify.command import identify
 from salient.identify.link import HOLD_RECORD_S, IDLE, LOSS_MS, IdentifyError, linked
@@ -75,7 +77,7 @@ def test_the_machine_is_found_and_the_name_plate_s_magnetics_are_not_used(identi
 
 
 @pytest.mark.in_turns
-@pytest.mark.parametrize("condition", ["17 bits", "17 bits, load"])
+@pytest.mark.parametrize("condition", ["17 bits", "17 bits, load", "17 bits, eddy 1 mS"])
 def test_noise_friction_eccentricity_and_a_load_change_the_result_little(tmp_path, condition):
     """Noise of 2 LSB, offsets, 0.05 degrees of eccentricity, Coulomb friction of 2 %, load of 20 % of rated torque."""
     path = machine_path("saturating")
@@ -86,6 +88,9 @@ def test_noise_friction_eccentricity_and_a_load_change_the_result_little(tmp_pat
         assert 1e-6 < abs(found[name]) < most, name
     assert 95.0 < found["peak"] <= 105.0
     assert 5.0 < time_s < 30.0
+    conductance_S = CONDITIONS[condition].get("eddy_S", 0.0)
+    assert found["eddy_mS"] == pytest.approx(1e3 * conductance_S, abs=0.02)
+    assert load_machine(file).circuit["eddy_conductance_S"] == pytest.approx(conductance_S, abs=2e-5)
 
 
 def test_only_one_phase_carries_current_and_all_are_off_at_the_end(identifying):
@@ -169,6 +174,76 @@ def test_a_fault_at_any_instant_ends_them_and_can_be_cleared(identifying, seed):
     bench.drive.speed_reference_rpm = 300
     bench.run_for(0.4)
     assert bench.drive.state == "run"
+
+
+BUNDLED = ("finite_element", "linear_cosine", "linear_trapezoid", "saturating")
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("seed", range(1, 25))
+def test_order_direction_and_angles_are_right_from_any_start(seed):
+    """Or the name plate has another number of poles, and is refused."""
+    start = identified_starts.drawn(seed, BUNDLED)
+    poles = load_machine(machine_path(start.machine)).rotor_poles
+    result = identified_starts.run_one(start)
+    assert result["verdict"] == ("right" if start.plate_poles == poles else "refused"), result
+
+
+def test_fewer_poles_than_the_name_plate_s_are_refused(identifying):
+    bench = identifying(initial_angle_deg=20.0)
+    with linked(bench) as link:
+        sequence = Sequence(link, 3, 8, lambda _: None)
+        sequence.probe()
+        with pytest.raises(IdentifyError, match="a multiple of 2 strokes of 8 rotor poles"):
+            sequence.align()
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_an_identification_broken_off_in_its_first_pulses(seed):
+    """Client killed or silent, a fault, STO: gates off in time, no file touched, the drive usable by another client."""
+    abort = replace(identified_aborts.drawn(seed), stage="rest", offset_s=0.03 + 0.004 * seed, loaded=False)
+    result = identified_aborts.run_one(abort)
+    assert result["place"], result
+    assert not result["wrong"], result
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("seed", range(9, 25))
+def test_an_identification_broken_off_at_any_instant(seed):
+    """As above, in the holds, the map, the spin-up or the coasting."""
+    result = identified_aborts.run_one(identified_aborts.drawn(seed))
+    assert not result["wrong"], result
+
+
+@pytest.mark.in_turns
+def test_a_process_killed_while_it_writes_leaves_the_old_machine_or_the_new_one():
+    result = identified_aborts.writing()
+    assert int(result["ending"].split()[0]) > 10
+    assert not result["wrong"], result
+
+
+def test_a_gate_that_is_on_shows_in_the_recording():
+    """240 V and 2 A that decay: with all gates off the link takes back 480 W, freewheeling nothing."""
+    time_s = np.arange(4) * 5e-5
+    record = np.zeros(4, [("time_s", "f8"), *((name, "f4") for name in (
+        "bus_voltage_V", "current_a_A", "current_b_A", "energy_drawn_J", "energy_returned_J"))])
+    record["time_s"], record["bus_voltage_V"], record["current_a_A"] = time_s, 240.0, 2.0
+    record["energy_returned_J"] = 480.0 * np.minimum(time_s, 1e-4)
+    assert identified_aborts.gates_on(record, 0.1).tolist() == [False, False, False, True]
+    record["current_b_A"] = 0.05
+    assert identified_aborts.gates_on(record, 3.0).tolist() == [False] * 4
+
+
+def test_a_pause_of_the_client_ends_the_experiments_and_does_not_arm_again(identifying):
+    bench = identifying()
+    with linked(bench) as link:
+        link.rest(0.02)
+        bench.drive.silence()
+        bench.run_for(0.3)
+        with pytest.raises(IdentifyError, match="no command reached it"):
+            link.run(Experiment("pulse", 0, 0.1), 0.2)
+        assert bench.drive.state == "ready"
+        assert not bench.drive.armed
 
 
 def test_an_open_winding_is_refused_by_name(identifying):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import sys
 import tempfile
 import tomllib
@@ -28,6 +29,7 @@ from salient.experiments.scenario import LoadStep, Record, SpeedStep, run_all
 from salient.identify.command import TELEMETRY_PERIOD_MS, identify
 from salient.identify.result import Result, machine_text, write_machine
 from salient.machine.cache import bench_config
+from salient.machine.drive_data import DriveData
 from salient.machine.file import Machine, load_machine
 from salient.machine.path import machine_path, stated_conditions
 from salient.machine.scaling import scaling_of
@@ -40,8 +42,12 @@ CONDITIONS: Mapping[str, Mapping[str, float]] = {
     "14 bits": {**_SENSORS, "bits": 14},
     "load": {"load": 0.2},
     "17 bits, load": {**_SENSORS, "load": 0.2},
+    "eddy 1 mS": {"eddy_S": 1e-3},
+    "eddy 2 mS": {"eddy_S": 2e-3},
+    "17 bits, eddy 1 mS": {**_SENSORS, "eddy_S": 1e-3},
 }
-"""Noise and offset of the currents in LSB of the converter, Coulomb friction and load as parts of the rated torque."""
+"""Noise and offset of the currents in LSB of the converter, Coulomb friction and load as parts of the rated torque;
+conductance of the iron."""
 STEP_RPM, LOAD_NM, START_RPM = 150.0, 8.0, 600.0
 _BINS, _REPEATS = 36, 2
 
@@ -76,22 +82,15 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     plate = plate_of(path, folder)
     machine = load_machine(plate)
     data = scaling_of(path, load_machine(path)).data
+    if "eddy_S" in condition:
+        path = _with_eddy_currents(path, condition["eddy_S"], folder)
     config = bench_config({"machine": str(plate), "true_machine": str(path), "controller": "salient",
                            "telemetry_period_ms": TELEMETRY_PERIOD_MS,
                            **({"encoder_bits": int(condition["bits"])} if "bits" in condition else {})})
-    lsb_A = data.adc_current_A / 4096.0
     with tempfile.TemporaryDirectory() as socket:
         bench = Bench(config, f"unix:{socket}/bus")
         try:
-            settings = {"current_noise_A": condition.get("noise_lsb", 0.0) * lsb_A,
-                        "current_sensor_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
-                        "encoder_eccentricity_deg": condition.get("encoder_eccentricity_deg", 0.0),
-                        "load_torque_Nm": condition.get("load", 0.0) * data.torque_rated_Nm}
-            for name, value in settings.items():
-                if value:
-                    setattr(bench.rig, name, value)
-            if condition.get("coulomb"):
-                bench.fault("coulomb_friction", torque_Nm=condition["coulomb"] * data.torque_rated_Nm)
+            disturb(bench, condition, data)
             result = identify(bench, machine, _BINS, _REPEATS, tell)
             time_s = bench.time_s
         finally:
@@ -99,6 +98,32 @@ def identified(path: Path, condition: Mapping[str, float], folder: Path, tell: A
     file = folder / f"measured_{path.stem}{label and '_'}{'_'.join(label.replace(',', '').split())}.toml"
     write_machine(result, plate, file)
     return result, file, time_s
+
+
+def _with_eddy_currents(path: Path, conductance_S: float, folder: Path) -> Path:
+    """A machine file with another conductance of its iron, and its map."""
+    other = folder / f"eddy_{1e6 * conductance_S:.0f}" / path.name
+    other.parent.mkdir(parents=True, exist_ok=True)
+    table = tomllib.loads(path.read_text(encoding="utf-8-sig"))["magnetics"].get("file")
+    if table:
+        shutil.copyfile(path.parent / table, other.parent / table)
+    other.write_text(f"{path.read_text(encoding='utf-8-sig')}\n[eddy_current]\nconductance_S = {conductance_S}\n",
+                     encoding="utf-8")
+    return other
+
+
+def disturb(bench: Bench, condition: Mapping[str, float], data: DriveData) -> None:
+    """Sensors, friction and load of a condition; data: of the drive."""
+    lsb_A = data.adc_current_A / 4096.0
+    settings = {"current_noise_A": condition.get("noise_lsb", 0.0) * lsb_A,
+                "current_sensor_offset_A": condition.get("offset_lsb", 0.0) * lsb_A,
+                "encoder_eccentricity_deg": condition.get("encoder_eccentricity_deg", 0.0),
+                "load_torque_Nm": condition.get("load", 0.0) * data.torque_rated_Nm}
+    for name, value in settings.items():
+        if value:
+            setattr(bench.rig, name, value)
+    if condition.get("coulomb"):
+        bench.fault("coulomb_friction", torque_Nm=condition["coulomb"] * data.torque_rated_Nm)
 
 
 def errors(found: Machine, true: Machine, result: Result) -> dict[str, float]:
@@ -118,6 +143,7 @@ def errors(found: Machine, true: Machine, result: Result) -> dict[str, float]:
             "resistance": 100.0 * (found.resistance_ohm / true.resistance_ohm - 1.0),
             "inertia": 100.0 * (found.inertia_kg_m2 / true.inertia_kg_m2 - 1.0),
             "friction": 100.0 * (found.friction_Nm_s / true.friction_Nm_s - 1.0),
+            "eddy_mS": 1e3 * result.fit.conductance_S,
             "peak": 100.0 * float(result.log["current_A"].max()) / result.limit_A}
 
 

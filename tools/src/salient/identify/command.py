@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,26 +29,34 @@ def run(options: argparse.Namespace) -> int:
     the name plate; IdentifyError: the drive does not take the experiments, or they do not determine the machine; then
     nothing is written."""
     plate = machine_path(options.machine)
-    machine = load_machine(plate)
+    load_machine(plate)
     if options.out.suffix != ".toml":
         raise UsageError(f"--out {options.out}: must be FILE.toml")
-    page = options.out.with_suffix(".html")
-    make_folder(options.out.parent, [options.out.name, options.out.with_suffix(".csv").name, page.name])
+    make_folder(options.out.parent)
     with _session(options) as session:
-        result = identify(session, machine, options.bins, options.repeats, print_line=lambda line: print(
+        result = measure(session, plate, options.out, options.bins, options.repeats, lambda line: print(
             f"{session.time_s:7.2f} s  {line}", flush=True))
-    identified = write_machine(result, plate, options.out)
-    write_report(result, identified, machine, page)
     for quantity in result.quantities:
         print(f"{quantity.name:45} {quantity.value:12.6g} +- {quantity.half_width:.2g} {quantity.unit}: "
               f"{quantity.verdict}")
     for warning in result.warnings:
         print(f"not ready to run: {warning}")
-    print(f"machine: {options.out}\nreport:  {page}")
+    print(f"machine: {options.out}\nreport:  {options.out.with_suffix('.html')}")
     return 0
 
 
-def identify(session: Session, plate: Machine, bins: int, repeats: int, print_line) -> Result:  # type: ignore[no-untyped-def]
+def measure(session: Session, plate: Path, out: Path, bins: int, repeats: int, print_line: Callable[[str], None]
+            ) -> Result:
+    """identify, and its files: the machine file `out`, its map and its page. They are written at the end: until then,
+    and when there is no result, the files of an earlier run stay."""
+    machine = load_machine(plate)
+    result = identify(session, machine, bins, repeats, print_line)
+    write_machine(result, plate, out, lambda found, page: write_report(result, found, machine, page))
+    return result
+
+
+def identify(session: Session, plate: Machine, bins: int, repeats: int, print_line: Callable[[str], None]
+             ) -> Result:
     """All experiments of a session's drive, and the machine by them. IdentifyError: see run."""
     with linked(session) as link:
         sequence = Sequence(link, plate.phases, plate.rotor_poles, print_line)

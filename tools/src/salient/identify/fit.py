@@ -1,10 +1,11 @@
 """The electrical part of the machine from the pulses, as one least-squares problem:
 
-    integral of s Vdc dt = psi(theta - delta, i) + R integral of i dt + 2 V t
+    integral of s Vdc dt = psi(theta - delta, i - G u) + R integral of i dt + 2 V t,   u = s Vdc - R i - 2 V
 
 s is +1 with both switches on, 0 freewheeling, -1 with both off. psi is linear in the coefficients of its spline, and
 so are R and the mean drop V of a device. Columns of the derivatives (Gauss-Newton) add what is not: the angle of each
-phase, the delay of the current sensors, their offsets, the eccentricity of the encoder.
+phase, the delay of the current sensors, their offsets, the eccentricity of the encoder, and the conductance G of the
+iron, in which the voltage u makes eddy currents (emulator/plant/coupled.h).
 
 Not observable, because the pulses would be the same: a common gain of all currents, one of the DC-link voltage, and
 the difference of the drops of a switch and a diode.
@@ -34,9 +35,9 @@ predict a pulse best, for a smoother map averages more noise and follows a corne
 _FOLDS, _ROUGHER = 4, 0.1
 _EXACT_PART = 0.1
 """Least part of the residual that is not of the current's noise."""
-_DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART = 2.0, 0.005, 20e-6, 0.01
+_DROP_V, _ECCENTRICITY_RAD, _DELAY_S, _OFFSET_PART, _EDDY_PART = 2.0, 0.005, 20e-6, 0.01, 0.02
 """Deviations of weak priors, for what a machine may not show."""
-_BEGIN_PART = 0.03
+_BEGIN_PART = 0.003
 _MOST = 0.25
 """Part of the pulses that may end at less than the largest common current."""
 _INITIAL_PART, _LEAST_PART = 0.1, 0.1
@@ -50,8 +51,8 @@ _SIGN = {OFF: -1.0, ZERO: 0.0, ON: 1.0}
 @dataclass(frozen=True)
 class Rows:
     """Samples of pulses. angle_rad: from the rough aligned angle; shaft_rad: of the encoder; flux_Wb: integral of the
-    voltage; charge_As: of the current; time_s: since the begin of the pulse; slope_A_s: of the current before the
-    sample; pulse: number."""
+    voltage; charge_As: of the current; time_s: since the begin of the pulse; slope_A_s, supply_V: of the current and of
+    the terminals before the sample; pulse: number."""
 
     pulse: np.ndarray
     row: np.ndarray
@@ -62,6 +63,7 @@ class Rows:
     charge_As: np.ndarray
     time_s: np.ndarray
     slope_A_s: np.ndarray
+    supply_V: np.ndarray
 
 
 def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
@@ -87,7 +89,8 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
     on = np.nonzero(log["action"] == ON)[0]
     if not len(on) or (log["action"] == PART).any():
         return None
-    if on[0] == 0 or current[on[0]] > _BEGIN_PART * current.max():  # it began with the current of another one
+    begin_A = 4.0 * found.noise_A[pulse.phase] + _BEGIN_PART * current.max()
+    if on[0] == 0 or (current[:on[0] + 1] > begin_A).any():  # it began with the flux of another one
         return None
     floor_A = 4.0 * found.noise_A[pulse.phase] + 0.01 * current.max()
     first = on[0]
@@ -106,7 +109,7 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
     at = np.arange(first + 1, last + 1)
     slope = (current[at] - current[at - 1]) / step_s
     columns = [2.0 * math.pi * (turn - found.position[pulse.phase]), 2.0 * math.pi * turn, current[at], flux, charge,
-               time_s, slope]
+               time_s, slope, sign * voltage]
     return [column[live] for column in columns]
 
 
@@ -114,7 +117,7 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
 class Fit:
     """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
     device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest;
-    smoothness: weights of the roughness over angle and current."""
+    conductance_S: of the iron; smoothness: weights of the roughness over angle and current."""
 
     basis: FluxBasis
     coefficients: np.ndarray
@@ -124,6 +127,7 @@ class Fit:
     eccentricity_rad: np.ndarray
     delay_s: float
     offset_A: np.ndarray
+    conductance_S: float
     residual_Wb: np.ndarray
     smoothness: tuple[float, float] = (1e-3, 1e-3)
 
@@ -134,6 +138,11 @@ class Fit:
     def torque_Nm(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
         """Derivative of the co-energy by the angle."""
         return self.basis.value(self.coefficients, angle_rad, current_A, 1, -1)
+
+    def iron_A(self, current_A: np.ndarray, supply_V: np.ndarray) -> np.ndarray:
+        """Current of a winding less the eddy currents that the voltage of its terminals makes."""
+        induced_V = supply_V - self.resistance_ohm * current_A - 2.0 * self.drop_V
+        return np.asarray(current_A - self.conductance_S * induced_V)
 
     def shaft_rad(self, encoder_rad: np.ndarray) -> np.ndarray:
         """Angle of the shaft by the encoder's."""
@@ -146,7 +155,7 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
     """The machine that explains the rows best."""
     basis = FluxBasis(rotor_poles, current_max_A, angles, currents)
     fit = Fit(basis, np.zeros(basis.size), 0.0, 0.0, np.zeros(phases), np.zeros(2), 0.0, np.zeros(phases),
-              np.zeros(0))
+              0.0, np.zeros(0))
     for iteration in range(_ITERATIONS):
         problem = _problem(rows, phases, fit, linear=iteration == 0)
         if iteration == _SMOOTHED:
@@ -184,7 +193,8 @@ def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Angles from aligned and currents of the rows with what is known of the sensors."""
     cosine, sine = fit.eccentricity_rad
     angle = (rows.angle_rad - fit.delta_rad[rows.row] - cosine * np.cos(rows.shaft_rad) - sine * np.sin(rows.shaft_rad))
-    return angle, np.maximum(rows.current_A + fit.offset_A[rows.row] + fit.delay_s * rows.slope_A_s, 0.0)
+    current = fit.iron_A(rows.current_A, rows.supply_V) + fit.offset_A[rows.row] + fit.delay_s * rows.slope_A_s
+    return angle, np.maximum(current, 0.0)
 
 
 @dataclass(frozen=True)
@@ -245,9 +255,11 @@ def _problem(rows: Rows, phases: int, fit: Fit, linear: bool) -> _Problem:
         columns += [-by_angle * each for each in of_phase]
         columns += [-by_angle * np.cos(rows.shaft_rad), -by_angle * np.sin(rows.shaft_rad), by_current * rows.slope_A_s]
         columns += [by_current * each for each in of_phase]
+        columns += [by_current * (fit.resistance_ohm * rows.current_A + 2.0 * fit.drop_V - rows.supply_V)]
         deviations += [math.inf] * phases + [_ECCENTRICITY_RAD] * 2 + [_DELAY_S]
         deviations += [_OFFSET_PART * basis.current_max_A] * phases
-        known += [0.0] * phases + [*-fit.eccentricity_rad, -fit.delay_s, *-fit.offset_A]
+        deviations += [_EDDY_PART * basis.current_max_A / float(np.abs(rows.supply_V).max())]
+        known += [0.0] * phases + [*-fit.eccentricity_rad, -fit.delay_s, *-fit.offset_A, -fit.conductance_S]
     design = sparse.hstack([basis.design(angle, current), sparse.csr_matrix(np.array(columns).T)]).tocsr()
     scale = float(weights @ design[:, :n].multiply(design[:, :n]).sum(axis=1).A1) / n
     noise = float(np.mean(weights * fit.residual_Wb**2)) if not linear else \
@@ -274,10 +286,11 @@ def _solution(problem: _Problem, rows: Rows, phases: int, drawn: np.ndarray | No
     normal, right = (weighted.T @ design).toarray() + np.diag(problem.ridge), weighted.T @ rows.flux_Wb + problem.pull
     normal[:n, :n] += _forms(problem, fit.smoothness)
     x = _constrained(problem, normal, right, n)
-    more = np.zeros(2 * phases + 3) if problem.linear else x[n + 2:]
+    more = np.zeros(2 * phases + 4) if problem.linear else x[n + 2:]
     return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
                fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
-               fit.offset_A + more[phases + 3:], rows.flux_Wb - design @ x, fit.smoothness)
+               fit.offset_A + more[phases + 3:-1], fit.conductance_S + float(more[-1]), rows.flux_Wb - design @ x,
+               fit.smoothness)
 
 
 def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:

@@ -105,6 +105,13 @@ class Link:
         return max(self._member(f"identify.energy[{phase}]") for phase in phases) / most
 
     def check(self) -> None:
+        """IdentifyError: see check_limits; or a pause of the commands has ended the experiments. The drive is not armed
+        again then: what the rotor did in between is in no record."""
+        self.check_limits()
+        if self._session.drive.state != "run":
+            raise IdentifyError("the drive has ended the experiments: no command reached it for command_timeout_ms")
+
+    def check_limits(self) -> None:
         """IdentifyError: a limit or a fault has ended the experiments, or records were lost."""
         drive = self._session.drive
         if drive.state == "fault":
@@ -157,6 +164,8 @@ class Link:
 
     def _advance(self) -> np.ndarray:
         self._session.advance_to(self._session.time_ns + _STEP_NS)
+        if self._session.drive.state != "run":
+            self.check()
         if self._session.time_ns - self._kept_alive_ns > _KEEP_ALIVE_NS:
             self._kept_alive_ns = self._session.time_ns
             self.check()
@@ -165,6 +174,8 @@ class Link:
     def run(self, experiment: Experiment, timeout_s: float) -> np.ndarray:
         """Begins an experiment, and lets time pass until the drive is idle again, or until the timeout; returns its
         records. IdentifyError: see check."""
+        if self._session.drive.state != "run":
+            self.check()
         number = self._session.drive.begin_experiment(experiment) & _NUMBER_MASK
         begin_ns = self._session.time_ns
         parts: list[np.ndarray] = []
@@ -184,6 +195,12 @@ class Link:
                                 f"{self._session.drive.state}")
         return np.concatenate(parts)
 
+    def interrupts(self, log: np.ndarray) -> bool:
+        """Whether the experiment of these records has ended one with a current, whose flux its pulse then begins
+        with."""
+        before = self.log[:np.searchsorted(self.log["time_us"], log["time_us"][0])][-1:]
+        return bool(np.isin(before["state"], (HOLDS, CHARGES, FREEWHEELS, DISCHARGES)).any())
+
     def rest(self, duration_s: float) -> np.ndarray:
         """All switches off."""
         return self.run(Experiment("rest"), duration_s)
@@ -202,7 +219,7 @@ def linked(session: Session) -> Iterator[Link]:
         drive.begin_experiment(Experiment("rest"))
         deadline_s = session.time_s + 1.0
         while drive.state != "run":
-            link.check()
+            link.check_limits()
             if session.time_s > deadline_s or drive.state == "fault":
                 raise IdentifyError(f"the drive does not begin: state {drive.state}, fault {drive.fault}"
                                     f"{'; ' + drive.hindrance if drive.hindrance else ''}")

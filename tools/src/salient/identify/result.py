@@ -6,10 +6,13 @@ map's also have the difference to a rougher fit. They do not hold what no pulse 
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
+import shutil
 import tempfile
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from salient.identify.fit import Fit
 from salient.identify.link import IdentifyError
 from salient.identify.sequence import Findings
 from salient.identify.shaft import Shaft, shaft_of
+from salient.machine.contradictions import EDDY_TIME_CONSTANT_S
 from salient.machine.file import Machine, MachineError, load_machine
 from salient.machine.scaling import scaling_of
 
@@ -37,15 +41,18 @@ _NEAR_LIMIT = 0.8
 """Largest current of most pulses, part of the limit, from which the map goes to it; else it ends there."""
 _EVENINGS = 6
 """Means over neighbouring currents until the loader's curve through the points rises everywhere."""
+_DIGEST = 8
+"""Digits of a map's content in the name of its file."""
 _MODEL_PART = 0.008
 """Part by which inertia and friction are wrong without any noise (salient.experiments.identified); cause not known."""
+CONDUCTANCE = "conductance of the iron for eddy currents"
 NOT_OBSERVABLE = (
     ("gain of the current sensors", "a common error scales flux linkage, torque and resistance down, inertia up: the "
      "pulses would be the same; by a meter in series"),
     ("gain of the DC-link voltage", "scales flux linkage and resistance alike; by a voltmeter"),
     ("drop of a switch less that of a diode", "acts as a change of the DC-link voltage"),
     ("mutual coupling of the phases", "one phase alone carries current in each pulse"),
-    ("eddy currents, hysteresis", "not in the model of the fit; they show as its residual"),
+    ("hysteresis", "not in the model of the fit; it shows as its residual"),
     ("differences of the phases", "the map is one of all phases; their aligned angles are not"),
 )
 
@@ -147,6 +154,7 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
         return _INTERVAL * float(np.std(list(values)))
 
     resistance = half(other.resistance_ohm for other in others)
+    conductance = half(other.conductance_S for other in others)
     inertia = math.hypot(_INTERVAL * shaft.inertia[1], _MODEL_PART * shaft.inertia[0])
     friction = math.hypot(_INTERVAL * shaft.friction[1], _MODEL_PART * shaft.friction[0])
     angle_deg = max(half(math.degrees(other.delta_rad[row]) for other in others) for row in range(len(found.phases)))
@@ -168,6 +176,8 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
                  half(math.degrees(math.hypot(*other.eccentricity_rad)) for other in others), "determined"),
         Quantity("delay of the current sensors", "us", 1e6 * fit.delay_s, half(1e6 * other.delay_s for other in others),
                  "determined"),
+        Quantity(CONDUCTANCE, "S", fit.conductance_S, conductance,
+                 "determined" if abs(fit.conductance_S) > conductance else "within its uncertainty"),
         Quantity("inertia", "kg m^2", shaft.inertia[0], inertia, _verdict(inertia / shaft.inertia[0], _FLAT_INERTIA)),
         Quantity("viscous friction", "N m s", shaft.friction[0], friction,
                  _verdict(friction / max(abs(shaft.friction[0]), 1e-12), 0.1)),
@@ -198,33 +208,53 @@ def _warnings(found: Findings, fit: Fit) -> list[str]:
 
 # --- the machine file ------------------------------------------------------------------------------------------------
 
-def write_machine(result: Result, plate: Path, path: Path) -> Machine:
+def write_machine(result: Result, plate: Path, path: Path,
+                  page: Callable[[Machine, Path], None] = lambda _, __: None) -> Machine:
     """Writes the machine file with its map beside it: motor by the result, board and ratings by the name plate's file.
-    Returns it as the loader reads it. IdentifyError: the loader refuses it, by its reason."""
+    page: writes the page of the machine to a path, which then has the file's name with .html. Returns the machine as
+    the loader reads it. IdentifyError: the loader refuses it, by its reason.
+
+    The map has a name by its content, and the machine file is replaced in one step after it: whatever ends this
+    process, the file that is there is the old one or the new one, with its own map. What is left by a process that was
+    killed here is removed by the next one."""
     machine = load_machine(plate)
     data = scaling_of(plate, machine).data
     board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
-    text = _text(result, tomllib.loads(plate.read_text(encoding="utf-8-sig")), machine, board, path)
-    table = path.with_suffix(".csv")
+    of_plate = tomllib.loads(plate.read_text(encoding="utf-8-sig"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:  # both files come into their place whole, or none does
+    for left in path.parent.glob(f"{_staging(path)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=_staging(path)) as folder:
         staged = Path(folder) / path.name
-        staged.write_text(text, encoding="utf-8")
         flux_Wb = result.flux_Wb
         for evenings in range(_EVENINGS + 1):
-            staged.with_suffix(".csv").write_text(_map_text(result, flux_Wb), encoding="utf-8")
+            rows = _map_text(result, flux_Wb)
+            table = path.with_name(f"{path.stem}_{hashlib.sha256(rows.encode()).hexdigest()[:_DIGEST]}.csv")
+            staged.with_name(table.name).write_text(rows, encoding="utf-8")
+            staged.write_text(_text(result, of_plate, machine, board, path.stem, table.name), encoding="utf-8")
             try:
-                load_machine(staged)
-                scaling_of(path, load_machine(staged))
+                found = load_machine(staged)
+                scaling_of(path, found)
                 break
             except MachineError as error:
                 if evenings == _EVENINGS:
                     reason = str(error).removeprefix(f"{staged}: ")
                     raise IdentifyError(f"the measured machine is refused: {reason}") from None
             flux_Wb = evened(flux_Wb)
-        staged.with_suffix(".csv").replace(table)
+        page(found, staged.with_suffix(".html"))
+        staged.with_name(table.name).replace(table)
         staged.replace(path)
+        if staged.with_suffix(".html").exists():
+            staged.with_suffix(".html").replace(path.with_suffix(".html"))
+    for other in path.parent.glob(f"{path.stem}_*.csv"):
+        if other != table and re.fullmatch(f"[0-9a-f]{{{_DIGEST}}}", other.stem.removeprefix(f"{path.stem}_")):
+            other.unlink(missing_ok=True)
     return load_machine(path)
+
+
+def _staging(path: Path) -> str:
+    """Begin of the name of the folder in which a machine file is written."""
+    return f".{path.name}."
 
 
 def _map_text(result: Result, flux_Wb: np.ndarray) -> str:
@@ -241,7 +271,8 @@ def evened(flux_Wb: np.ndarray) -> np.ndarray:
     return np.asarray(np.cumsum((padded[:, :-2] + 2.0 * padded[:, 1:-1] + padded[:, 2:]) / 4.0, axis=1))
 
 
-def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], path: Path) -> str:
+def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Mapping[str, float], name: str,
+          table: str) -> str:
     fit, shaft = result.fit, result.shaft
     converter = dict(plate.get("converter", {}))
     of_devices = sum(machine.converter.get(name, 0.0) for name in ("switch_resistance_ohm", "diode_resistance_ohm"))
@@ -258,15 +289,26 @@ def _text(result: Result, plate: Mapping[str, Any], machine: Machine, board: Map
         "winding": {"resistance_ohm": float(f"{resistance:.6g}")},
         "mechanics": {"inertia_kg_m2": float(f"{shaft.inertia[0]:.6g}"),
                       "friction_Nm_s": float(f"{max(shaft.friction[0], 0.0):.6g}")},
-        "magnetics": {"form": "map", "file": path.with_suffix(".csv").name},
+        "magnetics": {"form": "map", "file": table},
         "converter": converter,
+        **_eddy_current(result),
         **{name: plate[name] for name in ("dc_link", "thermal") if name in plate},
         "drive": drive,
     }
     if plate.get("drive", {}).get("parameters"):
         tables["drive.parameters"] = plate["drive"]["parameters"]
     return machine_text("Measured by the drive: tools/salient identify; board and ratings of its name plate.",
-                        path.stem, tables)
+                        name, tables)
+
+
+def _eddy_current(result: Result) -> dict[str, Mapping[str, Any]]:
+    """The table of the file, for the emulator alone; none while the conductance is within its uncertainty, or without
+    effect by the loader's bounds."""
+    found = next(each for each in result.quantities if each.name == CONDUCTANCE)
+    decay_s = found.value * float(result.flux_Wb[-1, 0] / result.current_A[-1, 0])
+    if found.value <= found.half_width or not EDDY_TIME_CONSTANT_S[0] <= decay_s <= EDDY_TIME_CONSTANT_S[1]:
+        return {}
+    return {"eddy_current": {"conductance_S": float(f"{found.value:.4g}")}}
 
 
 def _downwards(value: float) -> float:

@@ -51,6 +51,10 @@ _DRIFT_LOADED_S = 0.03
 _PROBE_PERIODS, _PROBES, _PROBE_MAX_S = 0.5, 3, 3.0
 """Electrical periods and pulses of each phase that show the inductances of a turning rotor, at least; at most that
 long."""
+_APART = 0.5
+"""Least rotation from where one phase holds the rotor to where the next one does, strokes."""
+_OFF = 0.4
+"""Largest distance of a phase from its place in the order, strokes."""
 _CLEARER = 4.0
 """Sum of squares of the second best order of the phases by the one of the best, from which that is believed."""
 _PUSH_MIN_S, _PUSH_S, _DECAY_S, _PUSH_PART = 0.003, 0.016, 0.004, 0.3
@@ -109,6 +113,8 @@ class Sequence:
         """Acceleration by a load that turns the rotor, rev/s^2; 0 of a rotor that stays where it is."""
         self._wound: dict[int, np.ndarray] = {}
         """Records of the pulses that showed the windings, by phase."""
+        self._missed: dict[tuple[int, int], int] = {}
+        """Successive pulses of a phase from a window that the rotor has not reached."""
         self._pushed: int | None = None
         """Phase of the last push, whose current may not have ended."""
         self._from, self._unmoved = 0.0, 0
@@ -147,7 +153,7 @@ class Sequence:
                ) -> np.ndarray:
         log = self.link.run(experiment, timeout_s)
         fired = (log["state"] >= CHARGES) & (log["state"] <= RESTS)
-        if keep and fired.any():
+        if keep and fired.any() and not self.link.interrupts(log):
             self.found.pulses.append(Pulse(experiment.phase, log[fired], mapped))
         return log
 
@@ -161,27 +167,55 @@ class Sequence:
             return
         self.tell(f"hold: each phase pulls the rotor with {HOLD_LEVEL:.0%} of the limit and is damped: order, "
                   "direction, angles")
-        phases = [*self.found.phases, self.found.phases[0]]
+        phases = self.found.phases
+        places = self._hold_each([*phases, phases[0]])
+        # The first hold may have found the rotor where friction holds it against the phase, opposite to its poles.
+        self._order([places[-1], *places[1:-1]])
+        if self._common_strokes(places[1:]) > 1:  # by chance, by the wiring, or fewer poles: in another order
+            count = len(phases)
+            places += self._hold_each([phases[2 * k % count if count % 2 else -k] for k in range(count)])
+            factor = self._common_strokes(places[1:])
+            if factor > 1:
+                raise IdentifyError(f"each phase pulls the rotor by a multiple of {factor} strokes of "
+                                    f"{self.found.rotor_poles} rotor poles: it has fewer")
+        self.found.wired_us = int(self.link.log["time_us"][-1])
+
+    def _hold_each(self, phases: list[int]) -> list[float]:
+        """Where phases hold the rotor, one after the other."""
         places: list[float] = []
+        apart = _APART / len(self.found.phases) / self.found.rotor_poles
         for number, phase in enumerate(phases):
             place, moved = self._settle(phase)
-            if moved < _STILL and number > 0:  # an unstable equilibrium: another phase moves the rotor out of it
+            if moved < apart and number > 0:  # an unstable equilibrium: another phase moves the rotor out of it
                 self.link.run(Experiment("hold", self._other(phases, number), HOLD_LEVEL), 0.05)
                 place, moved = self._settle(phase)
             places.append(place)
             self.link.rest(0.01)
             self._resistance(phase)
-        self._order(places)
-        self.found.wired_us = int(self.link.log["time_us"][-1])
+        return places
+
+    def _common_strokes(self, places: list[float]) -> int:
+        """Largest number of strokes of which all rotations between places are multiples."""
+        stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
+        return math.gcd(*(round((place - places[0]) / stroke) for place in places[1:]))
 
     def _order(self, places: list[float]) -> None:
-        """Positions and order of the phases by where each of them is aligned, rev."""
-        stroke = 1.0 / (len(self.found.phases) * self.found.rotor_poles)
-        for phase, place in zip(self.found.phases, places, strict=False):
-            strokes = (place - places[0]) / stroke
-            self.found.position[phase] = place
-            self.found.order[phase] = round(strokes) % len(self.found.phases)
-        if sorted(self.found.order.values()) != list(range(len(self.found.phases))):
+        """Positions and order of the phases by where each of them is aligned, rev: the order that explains all places
+        best, whose common origin has the mean of their errors, which friction makes."""
+        count = len(self.found.phases)
+        stroke = 1.0 / (count * self.found.rotor_poles)
+        strokes = (np.array(places) - places[0]) / stroke
+        fits = []
+        for others in itertools.permutations(range(1, count)):
+            left = 2.0 * math.pi * (strokes - [0, *others]) / count
+            origin = float(np.angle(np.exp(1j * left).mean()))
+            off = float(np.abs(np.angle(np.exp(1j * (left - origin)))).max())
+            fits.append((off * count / (2.0 * math.pi), origin * count / (2.0 * math.pi), (0, *others)))
+        off, origin, order = min(fits)
+        for phase, each in zip(self.found.phases, order, strict=True):
+            self.found.position[phase] = places[0] + (origin + each) * stroke
+            self.found.order[phase] = each
+        if off > _OFF:
             raise IdentifyError(f"the phases pull the rotor to {', '.join(f'{360 * place:.2f}' for place in places)} "
                                 f"degrees: not those of {self.found.rotor_poles} rotor poles, or the rotor is blocked")
 
@@ -260,10 +294,10 @@ class Sequence:
     def _other(phases: list[int], number: int) -> int:
         return next(phase for phase in phases if phase not in (phases[number], phases[number - 1]))
 
-    def _hold(self, phase: int, duration_s: float, centre: float | None) -> np.ndarray:
+    def _hold(self, phase: int, duration_s: float, centre: float | None, level: float = HOLD_LEVEL) -> np.ndarray:
         kind = "hold" if centre is None else "damped"
         angle = 0.0 if centre is None else min(centre % 1.0, 65535 / 65536)
-        return self.link.run(Experiment(kind, phase, HOLD_LEVEL, angle=angle), duration_s)["turn"]
+        return self.link.run(Experiment(kind, phase, level, angle=angle), duration_s)["turn"]
 
     def _settle(self, phase: int) -> tuple[float, float]:
         """Where a phase holds the rotor, and how far that was, rev."""
@@ -278,7 +312,8 @@ class Sequence:
             if np.ptp(turns[len(turns) // 2:]) < quiet:
                 break
             turns = self._hold(phase, max(0.5 * span_s, 0.15), centre_of(turns))
-        turns = self._hold(phase, _HOLD_S, None)  # friction may have stopped it anywhere, with a quarter of the current
+        # Friction may have stopped it anywhere, with a quarter of the current.
+        turns = self._hold(phase, _HOLD_S, None, PUSH_LEVEL)
         if np.ptp(turns) >= quiet:
             return centre_of(turns), moved
         tail = turns[len(turns) // 2:]
@@ -360,12 +395,13 @@ class Sequence:
                 log = self._push(direction, speed, turn)
                 continue
             self._end_push()
+            had = len(found.pulses)
             if self._load:  # up to the drift speed, and down to it the other way, while the load turns the rotor back
                 window, log = self._measure_falling(counts, star, speed, turn)
             else:
                 window, log = self._measure(counts, star, speed, turn, direction)
             fired = log[log["state"] == CHARGES]
-            if len(fired):
+            if len(fired) and len(found.pulses) > had:
                 phase = int(fired["phase"][0])
                 row = found.phases.index(phase)
                 place = found.electrical(phase, float(fired["turn"][0])) * bins
@@ -394,8 +430,11 @@ class Sequence:
         if choice is None:
             raise IdentifyError("no phase can move the rotor")
         row, window, arrival_s = choice
-        return window, self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
-                                   timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
+        log = self._pulse(self._windowed(self.found.phases[row], window, counts.shape[1], turn, direction),
+                          timeout_s=min(1.5 * arrival_s + 0.02, 0.5), mapped=True)
+        fired = bool((log["state"] == CHARGES).any())
+        self._missed[row, window] = 0 if fired else self._missed.get((row, window), 0) + 1
+        return window, log
 
     def _measure_falling(self, counts: np.ndarray, star: float, speed: float, turn: float) -> tuple[int, np.ndarray]:
         """As _measure, of a rotor that a load turns back: near standstill at once, of the phase whose present window
@@ -450,7 +489,7 @@ class Sequence:
                 arrival_s = ahead / found.rotor_poles / max(abs(speed), _SLOW * star)
                 # The variance of a mean of n pulses falls by about 1 / n^2 with one more.
                 had = (1.0 + of_window[min(window, bins - 1 - window)]) ** 2 * (1.0 + counts[row, window])
-                cost = (arrival_s + _PULSE_S) * had
+                cost = (arrival_s + _PULSE_S) * had * (1.0 + self._missed.get((row, window), 0)) ** 2
                 if best is None or cost < best[0]:
                     best = (cost, row, window, arrival_s)
         return None if best is None else best[1:]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from salient.identify.fit import Fit
-from salient.identify.link import IdentifyError
+from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
 from salient.identify.sequence import Findings
 
 _STEP_S, _WINDOW_S, _RUN = 0.5e-3, 0.06, 8
@@ -49,9 +49,19 @@ def torque_of(found: Findings, fit: Fit, log: np.ndarray) -> np.ndarray:
     return torque
 
 
+def _of_the_iron(fit: Fit, log: np.ndarray) -> np.ndarray:
+    """Records with the currents that make the torque: less the eddy currents by the voltage before each record."""
+    action = np.concatenate([[OFF], log["action"][:-1]])
+    sign = np.select([action == ON, action == ZERO], [1.0, 0.0], -1.0)
+    other = log.copy()
+    pulses = (action != PART) & (log["current_A"] > 0.01 * fit.basis.current_max_A)  # a hold's flux linkage is constant
+    other["current_A"][pulses] = fit.iron_A(log["current_A"], sign * log["dc_link_V"])[pulses]
+    return other
+
+
 def shaft_of(found: Findings, fit: Fit, log: np.ndarray) -> Shaft:
     """Inertia and friction by the records after the alignment. IdentifyError: the rotor has not turned enough."""
-    log = log[log["time_us"] > found.wired_us]
+    log = _of_the_iron(fit, log[log["time_us"] > found.wired_us])
     time_s = (log["time_us"] - log["time_us"][0]) * 1e-6
     angle = fit.shaft_rad(2.0 * math.pi * log["turn"])
     # Impulse of the torque between two records, by Simpson's rule, at their mean time.
