@@ -8,7 +8,7 @@ overflow, shifts, bounds, pointers, division by 0. That loops end within `unwind
 Conversions wrap as GCC defines it. tests/proofs.toml has for each proof what it proves, by source and function, and a
 bug: a text, and what takes its place. With its bug a proof must fail, otherwise it proves nothing.
 
-CBMC is that of Debian trixie, unpacked with its own C library in the build folder, or the one of the system.
+CBMC comes from Debian trixie, unpacked with its own C library in the build folder, or is the system's.
 DIR/runs.jsonl keeps the results for these sources, so that an interrupted run goes on; DIR/summary.json has the counts,
 which a run of all proofs also writes to tests/proofs.json. Exit code 1 when a proof fails, or holds with its bug.
 """
