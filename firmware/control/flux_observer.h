@@ -13,7 +13,7 @@
 #include <stdint.h>
 
 typedef struct {
-    int32_t gain_q30;              /* 0..1, Q1.30 */
+    int32_t gain_q30;              /* 0..1 - 2^-30, Q1.30 */
     int32_t resistance_period_q40; /* R Ts in ohm s, Q-9.40: below 2 ms ohm */
 } flux_observer_parameters_t;
 

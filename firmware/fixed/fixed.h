@@ -191,7 +191,7 @@ ALWAYS_INLINE int32_t fixed_shift_up_saturate_bits(int32_t value, unsigned shift
 #if defined __ARM_FEATURE_SAT && defined __OPTIMIZE__
     return ARM_SSAT_SHIFTED(value, shift, bits);
 #else
-    return fixed_saturate_bits(value * (1 << shift), bits);
+    return fixed_saturate_bits((int32_t)((uint32_t)value << shift), bits);
 #endif
 }
 

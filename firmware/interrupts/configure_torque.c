@@ -1,6 +1,7 @@
 #include "interrupts/configure_torque.h"
 
 #include "control/phase_map.h"
+#include "fixed/formats.h"
 #include "interrupts/deferred.h"
 #include "storage/parameters.h"
 
@@ -186,7 +187,7 @@ static predictive_torque_parameters_t predictive_from(const int32_t *values, uns
     return (predictive_torque_parameters_t){
         .flux =
             {
-                .gain_q30 = values[PARAMETER_FLUX_OBSERVER_GAIN] << 15,
+                .gain_q30 = fixed_min(values[PARAMETER_FLUX_OBSERVER_GAIN] << 15, ONE_Q30 - 1),
                 .resistance_period_q40 =
                     fixed_saturate(fixed_divide((int64_t)values[PARAMETER_RESISTANCE_OHM] << 16, rate)),
             },

@@ -70,7 +70,7 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
         if (all_but_timeout != 0) {
             return latch_fault(state_machine, all_but_timeout);
         }
-        state_machine->identifies = request == COMMAND_IDENTIFY && state_machine->rearmed;
+        state_machine->identifies = request == COMMAND_IDENTIFY && state_machine->rearmed && fault_mask == 0;
         state_machine->state = state_machine->identifies ? DRIVE_STATE_RUN : DRIVE_STATE_READY;
         break;
     case DRIVE_STATE_RUN:

@@ -59,6 +59,13 @@ TEST(FluxObserver, is_never_negative_and_saturates) {
     EXPECT_EQ(flux_q29, INT32_MAX);
 }
 
+TEST(FluxObserver, the_correction_of_the_largest_error_by_the_largest_gain_fits) {
+    const flux_observer_parameters_t p = {(1 << 30) - 1, 0};
+    int32_t flux_q29 = -1; // changed in memory
+    flux_observer_step(&p, &flux_q29, INT32_MAX, 0, 0);
+    EXPECT_GT(flux_q29, INT32_MAX - 8);
+}
+
 TEST(FluxObserver, an_error_decays_by_the_gain_each_sample) {
     const flux_observer_parameters_t p = parameters_of(0.25, 0.0);
     int32_t flux_q29 = int32_t(0.3 * Q29);

@@ -216,7 +216,8 @@ void expect_converted(const parameters_t &p, double rate_hz, unsigned encoder_bi
     }
     near("current limit", c.predictive.current_limit_q9, v(PARAMETER_CURRENT_LIMIT_A) * fixed_point::Q9, 0.0);
     near("reserve", c.predictive.reserve_q24, v(PARAMETER_TORQUE_RESERVE_NM) * fixed_point::Q24, 0.0);
-    near("flux gain", c.predictive.flux.gain_q30, v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q30, 0.0);
+    near("flux gain", c.predictive.flux.gain_q30,
+         std::min(v(PARAMETER_FLUX_OBSERVER_GAIN) * fixed_point::Q30, fixed_point::Q30 - 1), 0.0);
     const double q40 = std::ldexp(1.0, 40);
     near("resistance", c.predictive.flux.resistance_period_q40, v(PARAMETER_RESISTANCE_OHM) / rate_hz * q40, 1.0);
     near("period", c.predictive.period_q40, q40 / rate_hz, 1.0);
@@ -316,6 +317,16 @@ TEST(Configure, single_pulses_take_overlapping_windows_without_a_torque_reserve)
                            {{PARAMETER_TORQUE_SHARING, sharing}, {PARAMETER_TORQUE_RESERVE_NM, reserve_q24}});
             EXPECT_EQ(c.conduction.single_pulse, sharing && reserve_q24 == 0) << sharing << " " << reserve_q24;
         }
+    }
+}
+
+// The correction of an error of INT32_MAX would be rounded to 2^31.
+TEST(Configure, a_gain_of_the_flux_observer_of_1_is_less_by_an_lsb) {
+    const std::pair<int32_t, int32_t> gains[] = {{32768, (1 << 30) - 1}, {32767, 32767 << 15}, {0, 0}};
+    for (const auto &[value, gain_q30] : gains) {
+        const control_parameters_t control =
+            configured(DRIVE_CONTROLLER_SALIENT, 20000, 17, 12, {{PARAMETER_FLUX_OBSERVER_GAIN, value}});
+        EXPECT_EQ(control.predictive.flux.gain_q30, gain_q30) << value;
     }
 }
 

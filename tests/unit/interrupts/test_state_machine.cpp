@@ -217,6 +217,8 @@ TEST(StateMachineExperiments, they_begin_in_ready_alone_and_end_with_every_other
         EXPECT_EQ(machine.state, DRIVE_STATE_READY) << request;
         EXPECT_FALSE(machine.identifies);
     }
+    EXPECT_FALSE(tick(machine, {TIMEOUT, COMMAND_IDENTIFY, true}));
+    EXPECT_EQ(machine.state, DRIVE_STATE_READY) << "no run begins by a command that has timed out";
     tick(machine, {0, COMMAND_IDENTIFY, true});
     EXPECT_TRUE(tick(machine, {TIMEOUT, COMMAND_IDENTIFY, true}));
     EXPECT_EQ(machine.state, DRIVE_STATE_FAULT);
