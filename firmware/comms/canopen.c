@@ -27,14 +27,14 @@ static void reset_communication(canopen_t *canopen, uint32_t time_us) {
     }
     canopen->guard_toggle = false;
     canopen->emergencies = 0;
-    canopen->nmt = CANOPEN_NMT_INITIALISING;
-    canopen->boot_up = true;
+    canopen->nmt = CANOPEN_NMT_INITIALISING; /* where it remains without a node-ID, and hears LSS alone */
+    canopen->boot_up = canopen->node <= CANOPEN_NODE_MAX;
     canopen->heartbeat_us = canopen->heard_us = time_us;
 }
 
 COLD void canopen_init(canopen_t *canopen, unsigned node, unsigned serial, uint32_t time_us) {
     *canopen = (canopen_t){.serial = (uint8_t)serial,
-                           .lss = {.node = (uint8_t)(node <= CANOPEN_NODE_MAX ? node : 0)},
+                           .lss = {.node = (uint8_t)(node <= CANOPEN_NODE_MAX ? node : CANOPEN_NODE_NONE)},
                            .drive = {.step_us = time_us}};
     reset_communication(canopen, time_us);
     canopen_reset_values(canopen, true);
@@ -141,9 +141,18 @@ static void receive_data(canopen_t *canopen, const canopen_context_t *context, c
     }
 }
 
+static void receive_lss(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
+    if (canopen_lss_receive(canopen, context, frame)) {
+        reset_communication(canopen, context->time_us);
+        canopen_reset_values(canopen, false);
+    }
+}
+
 COLD void canopen_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
     const uint32_t id = frame->identifier;
-    if (frame->extended || canopen->restart || canopen->nmt == CANOPEN_NMT_INITIALISING) {
+    const bool initialises = canopen->nmt == CANOPEN_NMT_INITIALISING;
+    if (frame->extended || canopen->restart ||
+        (initialises && (canopen->node <= CANOPEN_NODE_MAX || frame->remote || id != CANOPEN_LSS_REQUEST))) {
         return;
     }
     if (frame->remote) {
@@ -155,7 +164,7 @@ COLD void canopen_receive(canopen_t *canopen, const canopen_context_t *context, 
     } else if (id == CANOPEN_SDO_REQUEST + canopen->node) {
         receive_sdo(canopen, context, frame);
     } else if (id == CANOPEN_LSS_REQUEST) {
-        canopen_lss_receive(canopen, context, frame);
+        receive_lss(canopen, context, frame);
     } else if (id > HEARTBEAT_ID && id <= HEARTBEAT_ID + CANOPEN_NODE_MAX) {
         receive_heartbeat(canopen, context, frame);
     } else {
@@ -252,6 +261,9 @@ COLD bool canopen_step(canopen_t *canopen, const canopen_context_t *context, com
         (int32_t)canopen->measured.voltage_q6 >= context->parameters->values[PARAMETER_UNDER_VOLTAGE_V];
     watch_master(canopen, context);
     canopen_drive_step(canopen, context, command);
+    if (canopen->node > CANOPEN_NODE_MAX) {
+        return true; /* nothing has a COB-ID */
+    }
     canopen_send_emergencies(canopen, context, canopen_drive_error_register(canopen));
     send_state(canopen, context);
     if (canopen->nmt == CANOPEN_NMT_OPERATIONAL) {

@@ -14,10 +14,15 @@ enum {
     SWITCH_SELECTIVE = 0x40, /* the first of four */
     SELECTED = 0x44,
     IDENTIFY = 0x46, /* the first of six */
+    IDENTIFY_WITHOUT_NODE = 0x4C,
     IDENTIFIED = 0x4F,
+    IDENTIFIED_WITHOUT_NODE = 0x50,
+    FAST_SCAN = 0x51,
     INQUIRE = 0x5A, /* the first of four */
     INQUIRE_NODE = 0x5E
 };
+#define FROM_BEGIN 0x80u /* bit check of a fast scan that begins */
+
 enum { DONE = 0, REFUSED = 1, STORE_FAILED = 2 };
 
 static uint32_t identity(const canopen_t *canopen, unsigned number) {
@@ -30,6 +35,11 @@ static void respond(canopen_t *canopen, const canopen_context_t *context, unsign
     uint8_t data[8] = {(uint8_t)command};
     canopen_pack(data + 1, 4, (int32_t)value);
     canopen_send(canopen, context, RESPONSE_ID, data, sizeof data);
+}
+
+/* Without a node-ID, and without one that is to come. */
+static bool has_none(const canopen_t *canopen) {
+    return canopen->node == CANOPEN_NODE_NONE && canopen->lss.node == CANOPEN_NODE_NONE;
 }
 
 /* The four numbers in order; another request in between begins anew. */
@@ -57,6 +67,27 @@ static void identify(canopen_t *canopen, const canopen_context_t *context, unsig
     }
 }
 
+/* A node without a node-ID answers while the bits of the number from the checked one on are its own. When all are, the
+ * scan goes to the next number; after the last of the four it is selected. */
+static void scan(canopen_t *canopen, const canopen_context_t *context, const uint8_t *data, uint32_t value) {
+    canopen_lss_t *lss = &canopen->lss;
+    const unsigned bit = data[5], number = data[6], next = data[7];
+    if (lss->configuring || !has_none(canopen)) {
+        return;
+    }
+    if (bit == FROM_BEGIN) {
+        lss->selected = 0;
+        respond(canopen, context, IDENTIFIED, 0);
+    } else if (bit < 32u && number == lss->selected && next < IDENTITIES &&
+               (identity(canopen, number) ^ value) >> bit == 0) {
+        if (bit == 0) {
+            lss->selected = (uint8_t)next;
+            lss->configuring = next < number;
+        }
+        respond(canopen, context, IDENTIFIED, 0);
+    }
+}
+
 static void store(canopen_t *canopen, const canopen_context_t *context) {
     parameters_verdict_t verdict = {PARAMETER_STATUS_NOT_WHILE_RUNNING, 0, 0};
     if (!context->conditions->running) {
@@ -73,7 +104,7 @@ static void configure(canopen_t *canopen, const canopen_context_t *context, cons
     canopen_lss_t *lss = &canopen->lss;
     switch (data[0]) {
     case CONFIGURE_NODE: {
-        const bool allowed = data[1] >= 1u && data[1] <= CANOPEN_NODE_MAX;
+        const bool allowed = (data[1] >= 1u && data[1] <= CANOPEN_NODE_MAX) || data[1] == CANOPEN_NODE_NONE;
         lss->node = allowed ? data[1] : lss->node;
         respond(canopen, context, CONFIGURE_NODE, allowed ? DONE : REFUSED);
         break;
@@ -95,20 +126,26 @@ static void configure(canopen_t *canopen, const canopen_context_t *context, cons
     }
 }
 
-COLD void canopen_lss_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
+COLD bool canopen_lss_receive(canopen_t *canopen, const canopen_context_t *context, const hal_can_frame_t *frame) {
     const uint8_t *data = frame->data;
     if (frame->length != 8u || canopen->nmt == CANOPEN_NMT_OPERATIONAL) {
-        return;
+        return false;
     }
     const uint32_t value = data[1] | (uint32_t)data[2] << 8 | (uint32_t)data[3] << 16 | (uint32_t)data[4] << 24;
     if (data[0] == SWITCH_GLOBAL) {
         canopen->lss.configuring = data[1] == 1u;
         canopen->lss.selected = 0;
+        return !canopen->lss.configuring && canopen->node == CANOPEN_NODE_NONE && canopen->lss.node != canopen->node;
     } else if (data[0] >= SWITCH_SELECTIVE && data[0] < SELECTED) {
         select(canopen, context, data[0] - (unsigned)SWITCH_SELECTIVE, value);
     } else if (data[0] >= IDENTIFY && data[0] < IDENTIFY + 6) {
         identify(canopen, context, data[0] - (unsigned)IDENTIFY, value);
+    } else if (data[0] == IDENTIFY_WITHOUT_NODE && has_none(canopen)) {
+        respond(canopen, context, IDENTIFIED_WITHOUT_NODE, 0);
+    } else if (data[0] == FAST_SCAN) {
+        scan(canopen, context, data, value);
     } else if (canopen->lss.configuring) {
         configure(canopen, context, data);
     }
+    return false;
 }

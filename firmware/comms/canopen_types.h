@@ -16,6 +16,7 @@
 #include "storage/parameters.h"
 
 #define CANOPEN_NODE_MAX 127u
+#define CANOPEN_NODE_NONE 255u /* unconfigured: LSS alone, until it gives a node-ID */
 #define CANOPEN_PDOS 4u
 #define CANOPEN_CONSUMERS 2u
 #define CANOPEN_EMERGENCIES 4u
@@ -85,7 +86,7 @@ typedef struct {
 
 typedef struct {
     bool configuring;
-    uint8_t selected; /* identity numbers that have matched, in order */
+    uint8_t selected; /* identity numbers that have matched, in order, to a selection or fast scan */
     uint8_t matched;  /* likewise of an identification */
     uint8_t node;     /* that takes effect with reset communication */
 } canopen_lss_t;

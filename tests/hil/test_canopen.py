@@ -314,6 +314,35 @@ def test_lss_of_the_package_sets_the_node_and_stores_it(make_bench, tmp_path):
         assert other.sdo[0x1014].raw == 0x89
 
 
+def test_lss_fast_scan_of_the_package_gives_two_drives_their_nodes(make_bench, tmp_path):
+    """Both lose their node-IDs; the scan finds one after the other by its serial number, and their masters reach them."""
+    bench = make_bench(protocol="canopen", drives=2)
+    with master(bench, tmp_path) as (network, node):
+        identity = [node.sdo[0x1018][i].raw for i in (1, 2, 3)]
+        network.lss.RESPONSE_TIMEOUT = 0.002  # of the wall clock: virtual time has passed when it begins
+        assert network.lss.fast_scan() == (False, None), "both have one"
+        network.lss.send_switch_state_global(network.lss.CONFIGURATION_STATE)
+        network.lss.configure_node_id(255)
+        network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+        network.nmt.state = "RESET COMMUNICATION"
+        network.run_for(0.01)
+        with pytest.raises(canopen.SdoCommunicationError):
+            node.sdo.RESPONSE_TIMEOUT = 0.01
+            node.sdo[0x1000].raw  # noqa: B018 - read
+        for serial in (1, 2):
+            found, numbers = network.lss.fast_scan()
+            assert found
+            assert numbers == [*identity, serial]
+            network.lss.configure_node_id(20 + serial)
+            network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+            network.run_for(0.01)
+            other = canopen.RemoteNode(20 + serial, str(tmp_path / "drive.eds"))
+            network.add_node(other)
+            assert other.sdo[0x1018][4].raw == serial
+        assert network.lss.fast_scan() == (False, None)
+        enable(other)
+
+
 def test_the_other_protocol_is_there_without_the_option(make_bench):
     bench = make_bench()
     assert bench.drive.parameters["protocol"] == 0

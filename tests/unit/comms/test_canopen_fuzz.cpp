@@ -208,12 +208,14 @@ TEST_F(CanopenFuzz, nothing_unsafe_and_no_hang) {
             conditions.running = command.request == COMMAND_RUN;
             cycle();
             expect_safe_command();
-            if (parameters.values[PARAMETER_PROTOCOL] == 0) { // set to the other protocol, by reset node
+            if (uint32_t(parameters.values[PARAMETER_PROTOCOL]) - 1u >= CANOPEN_NODE_MAX) { // the other protocol, or no node-ID
                 parameters_set(&parameters, PARAMETER_PROTOCOL, NODE);
             }
         }
         sent();
-        canopen.node = canopen.node == 0 ? NODE : canopen.node;
+        if (canopen.node - 1u >= CANOPEN_NODE_MAX) {
+            canopen_init(&canopen, NODE, 1, time_us);
+        }
     }
     EXPECT_GT(enabled, frames / 100) << "the frames reach what they are to try";
     EXPECT_GT(positions, frames / 2000);

@@ -347,4 +347,71 @@ TEST_F(CanopenPdo, lss_selects_and_sets_the_node) {
     EXPECT_EQ(response, bytes_t{});
 }
 
+TEST_F(CanopenPdo, lss_fast_scan_finds_a_device_without_a_node_and_gives_it_one) {
+    const auto lss = [&](bytes_t data) {
+        data.resize(8);
+        receive(0x7E5, data);
+        const auto frames = sent();
+        return frames.empty() ? 0u : unsigned(frames[0].data[0]);
+    };
+    const auto scan = [&](uint32_t value, unsigned bit, unsigned number, unsigned next) {
+        return lss({0x51, uint8_t(value), uint8_t(value >> 8), uint8_t(value >> 16), uint8_t(value >> 24), uint8_t(bit),
+                    uint8_t(number), uint8_t(next)});
+    };
+    const uint32_t identity[] = {CANOPEN_VENDOR, CANOPEN_PRODUCT, machine_tables.machine_hash, 1};
+    EXPECT_EQ(scan(0, 128, 0, 0), 0u) << "it has a node-ID";
+    EXPECT_EQ(lss({0x4C}), 0u);
+    lss({0x04, 1});
+    EXPECT_EQ(lss({0x11, 255}), 0x11u);
+    EXPECT_EQ(scan(0, 128, 0, 0), 0u) << "until reset communication";
+    receive(0, {130, 0});
+    cycle();
+    EXPECT_TRUE(sent().empty()) << "no boot-up";
+    for (const auto &frame : {sent_t{0, {1, 0}}, sent_t{0x600 + NODE, {0x40, 0, 0x10, 0, 0, 0, 0, 0}},
+                              sent_t{0x6FF, {0x40, 0, 0x10, 0, 0, 0, 0, 0}}, sent_t{0x2FF, {6, 0}}}) {
+        receive(frame.identifier, frame.data);
+        cycle();
+        EXPECT_TRUE(sent().empty()) << frame.identifier;
+        EXPECT_EQ(canopen.nmt, CANOPEN_NMT_INITIALISING);
+    }
+    values.status.fault = 3;
+    values.status.state = DRIVE_STATE_FAULT;
+    cycle();
+    EXPECT_TRUE(sent().empty()) << "no emergency without a COB-ID";
+    EXPECT_EQ(lss({0x4C}), 0x50u);
+    EXPECT_EQ(scan(0, 128, 0, 0), 0x4Fu);
+    EXPECT_EQ(scan(identity[1], 0, 1, 2), 0u) << "out of order";
+    EXPECT_EQ(scan(0, 0, 4, 0), 0u);
+    EXPECT_EQ(scan(0, 32, 0, 0), 0u);
+    for (unsigned number = 0; number < 4; number++) {
+        uint32_t found = 0;
+        for (unsigned bit = 32; bit-- > 0;) {
+            found |= scan(found, bit, number, number) == 0x4F ? 0 : 1u << bit;
+        }
+        EXPECT_EQ(found, identity[number]);
+        EXPECT_EQ(scan(found ^ 1, 0, number, (number + 1) % 4), 0u) << "another device's";
+        EXPECT_FALSE(canopen.lss.configuring);
+        EXPECT_EQ(scan(found, 0, number, (number + 1) % 4), 0x4Fu);
+    }
+    EXPECT_EQ(lss({0x5E}), 0x5Eu) << "it is selected";
+    EXPECT_EQ(scan(0, 128, 0, 0), 0u);
+    EXPECT_EQ(lss({0x11, 42}), 0x11u);
+    EXPECT_EQ(lss({0x17}), 0x17u);
+    EXPECT_EQ(parameters.values[PARAMETER_PROTOCOL], 42);
+    lss({0x04, 0});
+    cycle();
+    EXPECT_EQ(sent().front(), (sent_t{0x700 + 42, {0}}));
+    EXPECT_EQ(scan(0, 128, 0, 0), 0u);
+    receive(0x600 + 42, {0x40, 0, 0x10, 0, 0, 0, 0, 0});
+    EXPECT_EQ(sent().front().identifier, 0x580u + 42u);
+}
+
+TEST_F(CanopenPdo, a_device_starts_without_a_node_when_that_is_stored) {
+    canopen_init(&canopen, 255, 1, time_us);
+    cycle();
+    EXPECT_TRUE(sent().empty());
+    receive(0x7E5, {0x51, 0, 0, 0, 0, 128, 0, 0});
+    EXPECT_EQ(sent().front(), (sent_t{0x7E4, {0x4F, 0, 0, 0, 0, 0, 0, 0}}));
+}
+
 } // namespace
