@@ -315,7 +315,7 @@ def test_lss_of_the_package_sets_the_node_and_stores_it(make_bench, tmp_path):
 
 
 def test_lss_fast_scan_of_the_package_gives_two_drives_their_nodes(make_bench, tmp_path):
-    """Both lose their node-IDs; the scan finds one after the other by its serial number, and their masters reach them."""
+    """Both lose their node-IDs; the scan finds one after the other by its serial number, and they are reached."""
     bench = make_bench(protocol="canopen", drives=2)
     with master(bench, tmp_path) as (network, node):
         identity = [node.sdo[0x1018][i].raw for i in (1, 2, 3)]
@@ -326,9 +326,9 @@ def test_lss_fast_scan_of_the_package_gives_two_drives_their_nodes(make_bench, t
         network.lss.send_switch_state_global(network.lss.WAITING_STATE)
         network.nmt.state = "RESET COMMUNICATION"
         network.run_for(0.01)
+        node.sdo.RESPONSE_TIMEOUT = 0.01
         with pytest.raises(canopen.SdoCommunicationError):
-            node.sdo.RESPONSE_TIMEOUT = 0.01
-            node.sdo[0x1000].raw  # noqa: B018 - read
+            node.sdo.upload(0x1000, 0)
         for serial in (1, 2):
             found, numbers = network.lss.fast_scan()
             assert found
