@@ -56,8 +56,9 @@ def pair(clock_mhz: int) -> tuple[dict[str, Any], dict[str, Any]]:
 def modelled(described: dict[str, Any]) -> int:
     """Mask of the events of a world that host and image meet alike. Flipped bits have a place in the host's memory
     alone."""
-    return ALL_EVENTS & ~sum(1 << event["index"] for event in described["events"]
-                             if event["event"].endswith("_flipped") or event["event"] in _LEFT_OUT)
+    left_out: list[int] = [event["index"] for event in described["events"]
+                           if event["event"].endswith("_flipped") or event["event"] in _LEFT_OUT]
+    return ALL_EVENTS & ~sum(1 << index for index in left_out)
 
 
 def board_hashes(seed: int) -> dict[str, Any]:
