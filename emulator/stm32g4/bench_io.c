@@ -11,11 +11,16 @@
 #define VREF_V 3.3
 #define MEMORY_FIRST_PAGE 0 /* of bank 2 */
 #define EDGES_MAX (2 * TIMER_EDGES_MAX)
+#define NS_PER_S 1e9
 
 static board_t *board;
 static wiring_t wiring;
 static can_mailbox_t *mailbox[3];
 static uint64_t mailbox_request[3];
+static struct {
+    bool waits; /* for a mailbox of the bench, which has frames from before a reset of the drive */
+    hal_can_frame_t frame;
+} waiting[3];
 static uint32_t encoder_at; /* count whose levels the pins have */
 
 /* --- Analogue --- */
@@ -102,15 +107,11 @@ void bench_io_encoder(void) {
 
 /* --- Bus --- */
 
-static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
-    (void)context;
-    hal_can_frame_t copy = {
-        .identifier = frame->identifier, .extended = frame->extended, .remote = frame->remote, .length = frame->length};
-    memcpy(copy.data, frame->data, sizeof copy.data);
+static bool hand_over(unsigned buffer, const hal_can_frame_t *frame) {
     can_node_t *node = &board->bus->drives[board->bus_drive].node;
     mailbox[buffer] = NULL;
-    if (!board_can_transmit(board, &copy)) {
-        return;
+    if (!board_can_transmit(board, frame)) {
+        return false;
     }
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         can_mailbox_t *each = &node->mailbox[i];
@@ -119,11 +120,24 @@ static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
         }
     }
     mailbox_request[buffer] = mailbox[buffer] ? mailbox[buffer]->request : 0;
+    return true;
+}
+
+static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
+    (void)context;
+    waiting[buffer].frame = (hal_can_frame_t){
+        .identifier = frame->identifier, .extended = frame->extended, .remote = frame->remote, .length = frame->length};
+    memcpy(waiting[buffer].frame.data, frame->data, sizeof waiting[buffer].frame.data);
+    waiting[buffer].waits = !hand_over(buffer, &waiting[buffer].frame);
 }
 
 static bool pending(void *context, unsigned buffer) {
     (void)context;
-    return mailbox[buffer] && mailbox[buffer]->taken && mailbox[buffer]->request == mailbox_request[buffer];
+    if (waiting[buffer].waits) {
+        waiting[buffer].waits = !hand_over(buffer, &waiting[buffer].frame);
+    }
+    return waiting[buffer].waits ||
+           (mailbox[buffer] && mailbox[buffer]->taken && mailbox[buffer]->request == mailbox_request[buffer]);
 }
 
 static void cancel(void *context, unsigned buffer) {
@@ -201,8 +215,8 @@ static unsigned without_short_pulses(timer_edge_t edges[TIMER_EDGES_MAX], unsign
         const uint64_t from = edges[i].cycle > soc.now ? edges[i].cycle : soc.now;
         on += edges[i].level ? (i + 1 < count ? edges[i + 1].cycle : to) - from : 0;
     }
-    const double shortest = board->plant->minimum_pulse_ns * 1e-9 * (double)soc.hclk_hz;
-    const bool short_pulse = (double)on < shortest, short_gap = (double)(to - soc.now - on) < shortest;
+    const double shortest = board->plant->minimum_pulse_ns * (double)soc.hclk_hz, off = (double)(to - soc.now - on);
+    const bool short_pulse = (double)on * NS_PER_S < shortest, short_gap = off * NS_PER_S < shortest;
     if (count == 1 || !(short_pulse || short_gap)) {
         return count;
     }
@@ -271,6 +285,7 @@ void bench_io_reset(void) {
     set(wiring.encoder_index, false);
     bench_io_lines();
     memset(mailbox, 0, sizeof mailbox);
+    memset(waiting, 0, sizeof waiting);
 }
 
 void bench_io_open(board_t *of, const wiring_t *pins) {
