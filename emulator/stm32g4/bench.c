@@ -51,6 +51,7 @@ static void outputs_changed(void *context) {
         bench.start_cycle = soc.now;
         bench.origin_ns = board->time_ns;
         soc.untimed = true;
+        cpu_stall(soc.now); /* nor does the rest of this block of instructions take time */
         hold_clocks(false);
     } else if (!bench.started) {
         hold_clocks(true);
