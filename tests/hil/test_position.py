@@ -59,6 +59,14 @@ def test_any_encoder_holds_within_its_count_and_a_half(make_bench, bits):
     assert np.ptp(held) <= (1.5 if bits < 13 else 1.2) * 360 / 2**bits
 
 
+@pytest.mark.parametrize("target_deg", [5, 30, 33.3, 45.1])
+def test_a_target_between_coarse_counts_is_reached_by_a_rotor_in_its_count(make_bench, target_deg):
+    """A count of 10 bits is seven times as wide as position_window_deg."""
+    bench = running(make_bench, encoder_bits=10)
+    move(bench, target_deg, timeout_s=0.5)
+    assert abs(bench.telemetry[POSITION].last - target_deg) <= 360 / 2**10
+
+
 def test_a_load_step_is_held_and_returned_from_within_a_count(make_bench):
     bench = running(make_bench)
     move(bench, 30)
