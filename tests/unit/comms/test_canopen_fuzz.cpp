@@ -208,7 +208,8 @@ TEST_F(CanopenFuzz, nothing_unsafe_and_no_hang) {
             conditions.running = command.request == COMMAND_RUN;
             cycle();
             expect_safe_command();
-            if (uint32_t(parameters.values[PARAMETER_PROTOCOL]) - 1u >= CANOPEN_NODE_MAX) { // the other protocol, or no node-ID
+            if (uint32_t(parameters.values[PARAMETER_PROTOCOL]) - 1u >=
+                CANOPEN_NODE_MAX) { // the other protocol, or no node-ID
                 parameters_set(&parameters, PARAMETER_PROTOCOL, NODE);
             }
         }
