@@ -124,6 +124,18 @@ def test_an_inertia_far_from_its_parameter_is_known_within_the_first_move(make_b
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
 
 
+@pytest.mark.parametrize("machine", ["saturating", "linear_trapezoid"])
+def test_a_load_step_makes_no_rotor_of_another_inertia_swing(make_bench, machine):
+    """Before it has moved: with 0.3 times the parameter's it swung by 20 to 60 counts as long as it rested."""
+    bench = running(make_bench, machine=machine)
+    bench.rig.inertia_gain = 0.3
+    bench.load_torque_Nm = 4
+    bench.run_for(0.4)
+    angle, time_s = angle_deg(bench)
+    assert np.ptp(angle[time_s > bench.time_s - 0.1]) < 2 * COUNT_DEG
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+
+
 def test_a_client_that_ceases_is_a_stop_and_then_no_torque(make_bench):
     bench = running(make_bench)
     bench.drive.parameters["position_cycle_ms"] = 4

@@ -107,7 +107,7 @@ TEST(PositionProfile, moves_end_exactly_within_five_ticks_and_five_hundredths_of
                 }
                 ASSERT_TRUE(profile_arrived(&profile, target)) << way_rev << " " << motion.jerk;
                 EXPECT_LE(ticks, 1.05 * least + 5.0) << way_rev << " " << motion.jerk;
-                // Of the way of the jerk in a tick, by which its switch within one is missed.
+                // A part of the jerk's way in a tick: its switch within one is missed.
                 EXPECT_LE(double(beyond), COUNT_17_BITS / 10.0 + double(limits.q) / 2.0)
                     << way_rev << " " << motion.jerk;
                 tick(limits, &profile, target);
