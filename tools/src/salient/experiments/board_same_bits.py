@@ -56,7 +56,7 @@ def pair(clock_mhz: int) -> tuple[dict[str, Any], dict[str, Any]]:
 def modelled(described: dict[str, Any]) -> int:
     """Mask of the events of a world that host and image meet alike. Flipped bits have a place in the host's memory
     alone."""
-    return ALL_EVENTS & ~sum(1 << event["index"] for event in described["events"]
+    return ALL_EVENTS & ~sum(1 << int(event["index"]) for event in described["events"]
                              if event["event"].endswith("_flipped") or event["event"] in _LEFT_OUT)
 
 
