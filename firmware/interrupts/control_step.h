@@ -164,7 +164,7 @@ typedef struct {
     uint32_t updates_since_near;      /* since the speed was first near it */
     bool approaches_reference;        /* until then, and for some more */
     bool follows_position;            /* position mode, in which the next one takes the place of this */
-    bool accelerates;                 /* the position reference does */
+    bool accelerates;                 /* the law of position mode asks for a torque that shows the inertia */
     slow_counts_t slow_counts;
     count_course_t count_course;
     bp_tuner_t tuner;

@@ -262,8 +262,9 @@ static void average_torque(deferred_t *deferred, const deferred_input_t *input) 
     deferred->mean_torque_q24 += input->torque_sum_q24 >> 2;
 }
 
-/* A torque that is at its limit in order to change the speed follows no load, nor does the torque of a
- * position reference which accelerates. The next mean torque begins. */
+/* A torque that is at its limit in order to change the speed follows no load. In position mode the law's own torque
+ * counts, to which the observer's load is added: it accelerates the reference, or shows that a rotor at rest swings
+ * because its inertia is another one. The next mean torque begins. */
 static void identify_inertia(const control_parameters_t *parameters, deferred_t *deferred,
                              const deferred_input_t *input) {
     inertia_step(&parameters->inertia, &deferred->inertia, input->electrical, deferred->mean_torque_q24,

@@ -4,8 +4,8 @@
 #include "fixed/fixed.h"
 #include "interrupts/speed_control.h"
 
-/* Part of the largest torque that an acceleration asks for from which on it shows the inertia. */
-#define ACCELERATION_SHARE 32
+/* Part of the largest torque that the law asks for from which on it shows the inertia. */
+#define LAW_SHARE 32
 
 /* [SR-09] */
 static int32_t torque_limit_q24(const control_parameters_t *parameters, const control_state_t *state) {
@@ -26,10 +26,11 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
     deferred->speed_reference_q22 = speed_control_limited_q22(parameters, output.speed_q22); /* no ramp */
     deferred->run = true;
     deferred->follows_position = true;
-    deferred->accelerates = fixed_abs(output.torque_q24) >= parameters->conduction.torque_max_q24 / ACCELERATION_SHARE;
     speed_control_position(parameters, deferred, input, &command, limit_q24, results);
-    results->speed.speed_law_torque_q24 = fixed_add(results->speed.speed_law_torque_q24,
-                                                    fixed_multiply(output.torque_q24, deferred->inertia.ratio_q14, 14));
+    const int32_t torque_q24 = fixed_add(results->speed.speed_law_torque_q24,
+                                         fixed_multiply(output.torque_q24, deferred->inertia.ratio_q14, 14));
+    results->speed.speed_law_torque_q24 = torque_q24;
+    deferred->accelerates = fixed_abs(torque_q24) >= parameters->conduction.torque_max_q24 / LAW_SHARE;
 }
 
 /* Step of position mode: with its sample, which the other modes need not. False, and nothing is done, while the drive

@@ -59,6 +59,14 @@ def test_any_encoder_holds_within_its_count_and_a_half(make_bench, bits):
     assert np.ptp(held) <= (1.5 if bits < 13 else 1.2) * 360 / 2**bits
 
 
+@pytest.mark.parametrize("target_deg", [5, 30, 33.3, 45.1])
+def test_a_target_between_coarse_counts_is_reached_by_a_rotor_in_its_count(make_bench, target_deg):
+    """A count of 10 bits is seven times as wide as position_window_deg."""
+    bench = running(make_bench, encoder_bits=10)
+    move(bench, target_deg, timeout_s=0.5)
+    assert abs(bench.telemetry[POSITION].last - target_deg) <= 360 / 2**10
+
+
 def test_a_load_step_is_held_and_returned_from_within_a_count(make_bench):
     bench = running(make_bench)
     move(bench, 30)
@@ -113,6 +121,18 @@ def test_an_inertia_far_from_its_parameter_is_known_within_the_first_move(make_b
         beyond = (angle - angle[0] - target_deg)[time_s >= begin_s] * math.copysign(1, target_deg - before_deg)
         assert beyond.max() < 3 * COUNT_DEG
         assert abs(beyond[-1]) < COUNT_DEG
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
+
+
+@pytest.mark.parametrize("machine", ["saturating", "linear_trapezoid"])
+def test_a_load_step_makes_no_rotor_of_another_inertia_swing(make_bench, machine):
+    """Before it has moved: with 0.3 times the parameter's it swung by 20 to 60 counts as long as it rested."""
+    bench = running(make_bench, machine=machine)
+    bench.rig.inertia_gain = 0.3
+    bench.load_torque_Nm = 4
+    bench.run_for(0.4)
+    angle, time_s = angle_deg(bench)
+    assert np.ptp(angle[time_s > bench.time_s - 0.1]) < 2 * COUNT_DEG
     assert (bench.drive.state, bench.drive.fault) == ("run", "none")
 
 

@@ -244,6 +244,13 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
     }
 }
 
+/* Error of a reference at rest: of the count, none within it. */
+static int64_t error_of_count(const position_t *position, const position_sample_t *sample, int64_t reference) {
+    const int64_t begin = to_profile(position->counted - position->zero);
+    const int64_t end = begin + to_profile(sample->count);
+    return reference - fixed_clamp_64(reference, begin, end);
+}
+
 /* Beyond the limit at the end of a tick. */
 COLD NOINLINE static void check_following(const position_parameters_t *parameters, position_t *position,
                                           const position_sample_t *sample) {
@@ -259,7 +266,8 @@ COLD NOINLINE static void check_following(const position_parameters_t *parameter
         !position->stops && position->cubic_ticks == 0 && profile_arrived(&position->profile, position->target);
     status->arrived = position->sequence;
     status->reference_ended = arrived;
-    status->in_position = arrived && error <= parameters->window && error >= -parameters->window;
+    const int64_t left = sample->count != 0 ? error_of_count(position, sample, position->profile.start.x) : error;
+    status->in_position = arrived && left <= parameters->window && left >= -parameters->window;
 }
 
 /* An inertia has become known, larger than the one of the limits so far, with which the reference has left the rotor
@@ -332,13 +340,6 @@ static profile_limits_t limits_of(const position_parameters_t *parameters, const
         limits.speed = parameters->homing_speed;
     }
     return limits;
-}
-
-/* Error of a reference at rest: of the count, none within it. */
-static int64_t error_of_count(const position_t *position, const position_sample_t *sample, int64_t reference) {
-    const int64_t begin = to_profile(position->counted - position->zero);
-    const int64_t end = begin + to_profile(sample->count);
-    return reference - fixed_clamp_64(reference, begin, end);
 }
 
 static position_output_t output(const position_parameters_t *parameters, position_t *position,

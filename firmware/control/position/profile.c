@@ -206,7 +206,27 @@ static void begin_search(const profile_limits_t *limits, profile_t *profile, int
     profile->low = fixed_clamp_64(profile_by_q16(least - state->a, SIXTH_Q16), -limits->q, profile->high);
 }
 
-/* True when the jerk makes the reference too fast forwards, or end beyond the target. */
+/* Where the reference stands first, when it moves towards the target and brakes so much that it would turn before it
+ * ends: x + s (v t - |a| t^2 / 2 + J t^3 / 6), t = T - sqrt(T^2 - 2 |v| / J), T = |a| / J. Else where it ends. */
+NOINLINE static int64_t first_stop(const profile_limits_t *limits, const profile_state_t *state, int64_t target) {
+    const bool forward = state->v > 0;
+    const bool approaches = forward ? state->x < target && state->a < 0 : state->x > target && state->a > 0;
+    const int64_t v = (int64_t)magnitude(state->v), a = (int64_t)magnitude(state->a);
+    const uint32_t ramp_q16 = time_q16(a, limits->per_jerk);
+    if (!approaches || state->v == 0 || speed_of_ramp(a, ramp_q16) <= v) {
+        return profile_stop(limits, state);
+    }
+    const uint64_t all_q16 = (uint64_t)ramp_q16 * ramp_q16 >> 16,
+                   spent_q16 = 2 * (uint64_t)time_q16(v, limits->per_jerk);
+    const uint32_t left_q16 = root_q16(all_q16 > spent_q16 ? all_q16 - spent_q16 : 0);
+    const uint32_t t_q16 = ramp_q16 > left_q16 ? ramp_q16 - left_q16 : 0;
+    const int64_t jerk = (6 * limits->q >> PROFILE_MARGIN_SHIFT) * PROFILE_JERK_PARTS;
+    const int64_t sixth = profile_by_q16(profile_by_q16(jerk, t_q16), SIXTH_Q16);
+    const int64_t way = profile_by_q16(v - profile_by_q16((a >> 1) - sixth, t_q16), t_q16);
+    return state->x + (forward ? way : -way);
+}
+
+/* True when the jerk makes the reference too fast forwards, or end beyond the target, or pass it. */
 static bool too_high(const profile_limits_t *limits, const profile_t *profile, int64_t q, int64_t target) {
     const profile_state_t next = profile_advance(&profile->end, q);
     const int64_t ramp = speed_of_ramp(next.a, time_q16(next.a, limits->per_jerk));
@@ -216,7 +236,7 @@ static bool too_high(const profile_limits_t *limits, const profile_t *profile, i
     if (next.v - (next.a < 0 ? ramp : 0) < -limits->speed) {
         return false;
     }
-    return profile_stop(limits, &next) > target;
+    return first_stop(limits, &next, target) > target;
 }
 
 NOINLINE void profile_search(const profile_limits_t *limits, profile_t *profile, int64_t target) {

@@ -8,11 +8,12 @@
  *   d(w) = w / 2 (w / D + D / J) from w = D^2 / J on, below w sqrt(w / J)
  *
  * (derived here: the stop is a part of the S-curve from the speed w to rest, which began or will begin without
- * acceleration). It grows with the jerk of the coming tick. So the largest jerk, with which the stop is not beyond the
- * target and the speed not beyond its limit, is found by bisection, one step in each control period; it accelerates,
- * holds the speed and brakes at the right times, from any state, and a target or limit that changes needs nothing else:
- * the acceleration has no step. It is time-optimal but for the ticks, and for PROFILE_MARGIN of deceleration and jerk
- * that the plan leaves to make up for a switch within a tick.
+ * acceleration). It grows with the jerk of the coming tick, and so does the place where a reference that brakes too
+ * much for its speed turns. So the largest jerk, with which neither is beyond the target, and the speed not beyond its
+ * limit, is found by bisection, one step in each control period; it accelerates, holds the speed and brakes at the
+ * right times, from any state, and a target or limit that changes needs nothing else: the acceleration has no step. It
+ * is time-optimal but for the ticks, and for PROFILE_MARGIN of deceleration and jerk that the plan leaves to make up
+ * for a switch within a tick.
  *
  * The last three ticks follow a deadbeat law, the three jerks that bring a triple integrator to rest at the
  * target exactly, as soon as they are within the limits.

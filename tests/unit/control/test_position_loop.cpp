@@ -271,6 +271,25 @@ TEST_F(PositionLoop, in_position_is_of_the_set_point_that_arrived_names) {
     EXPECT_TRUE(position.status.in_position && position.status.arrived == command.set_point.sequence);
 }
 
+TEST_F(PositionLoop, a_rotor_within_the_count_of_its_target_is_in_position) {
+    order(POSITION_ORDER_PROFILE, 0.5);
+    ticks(1000);
+    const auto in_position = [&](double rev, uint32_t count) {
+        rotor_rev = rev;
+        position_sample_t now = sample();
+        now.encoder_angle = now.angle & ~((1u << 26) - 1u); // 6 bits
+        now.count = count;
+        for (int i = 0; i < PERIODS; i++) {
+            position_step(&parameters, &position, &command, &now);
+        }
+        return position.status.in_position;
+    };
+    EXPECT_TRUE(in_position(0.505, 1u << 26)); // 1.8 degrees; the window is half of one
+    EXPECT_FALSE(in_position(0.505, 0));
+    EXPECT_FALSE(in_position(0.52, 1u << 26)); // in the next count
+    EXPECT_TRUE(in_position(0.49, 1u << 26));  // whose end is the target
+}
+
 TEST_F(PositionLoop, begins_where_the_rotor_is_and_moves_to_the_target_over_turns) {
     order(POSITION_ORDER_PROFILE, -12.375);
     step();
