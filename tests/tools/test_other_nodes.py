@@ -440,7 +440,7 @@ def test_the_page_has_the_signals_of_the_other_nodes_and_the_traffic(browser, se
     for values, (name, wanted) in zip(found, expected.items(), strict=True):
         assert values == pytest.approx([value for _, value in wanted], rel=1e-9), name
     visitor.tab("Bus")
-    visitor.wait("document.getElementById('bus-messages').tBodies.length > 0")
+    visitor.wait("document.getElementById('bus-messages').innerText.includes('WHEELS')")
     rows = [row.split("\t") for row in page.locator("#bus-messages tbody tr").all_inner_texts()]
     by_name = {" ".join(row[0].split()): row[1:] for row in rows if len(row) == 4}
     assert float(by_name["WHEELS 12C"][1]) == pytest.approx(10.0, rel=0.01) and by_name["WHEELS 12C"][2] == "10"

@@ -374,6 +374,11 @@ TEST_F(CanopenPdo, lss_fast_scan_finds_a_device_without_a_node_and_gives_it_one)
         EXPECT_TRUE(sent().empty()) << frame.identifier;
         EXPECT_EQ(canopen.nmt, CANOPEN_NMT_INITIALISING);
     }
+    receive(0x7E5, {}, true);
+    EXPECT_EQ(lss({0x04, 0}), 0u) << "no node-ID is to come";
+    cycle();
+    EXPECT_TRUE(sent().empty());
+    EXPECT_EQ(canopen.nmt, CANOPEN_NMT_INITIALISING);
     values.status.fault = 3;
     values.status.state = DRIVE_STATE_FAULT;
     cycle();
@@ -383,6 +388,7 @@ TEST_F(CanopenPdo, lss_fast_scan_finds_a_device_without_a_node_and_gives_it_one)
     EXPECT_EQ(scan(identity[1], 0, 1, 2), 0u) << "out of order";
     EXPECT_EQ(scan(0, 0, 4, 0), 0u);
     EXPECT_EQ(scan(0, 32, 0, 0), 0u);
+    EXPECT_EQ(scan(identity[0], 0, 0, 4), 0u) << "no such number is next";
     for (unsigned number = 0; number < 4; number++) {
         uint32_t found = 0;
         for (unsigned bit = 32; bit-- > 0;) {
@@ -395,7 +401,13 @@ TEST_F(CanopenPdo, lss_fast_scan_finds_a_device_without_a_node_and_gives_it_one)
     }
     EXPECT_EQ(lss({0x5E}), 0x5Eu) << "it is selected";
     EXPECT_EQ(scan(0, 128, 0, 0), 0u);
+    for (unsigned inquiry = 0x5A; inquiry < 0x5E; inquiry++) {
+        EXPECT_EQ(lss({uint8_t(inquiry)}), inquiry);
+    }
+    EXPECT_EQ(lss({0x59}), 0u);
+    EXPECT_EQ(lss({0x5F}), 0u);
     EXPECT_EQ(lss({0x11, 42}), 0x11u);
+    EXPECT_EQ(lss({0x4C}), 0u) << "a node-ID is to come";
     EXPECT_EQ(lss({0x17}), 0x17u);
     EXPECT_EQ(parameters.values[PARAMETER_PROTOCOL], 42);
     lss({0x04, 0});
