@@ -1,4 +1,5 @@
 #include "part.h"
+#include "stimulus.h"
 
 extern uint32_t stack_top[], bss_start[], bss_end[];
 void start(void) __attribute__((noreturn));
@@ -43,14 +44,6 @@ void fast_clock(void) {
 }
 
 void print(uint32_t value) {
-    char text[11];
-    unsigned n = 0;
-    do {
-        text[n++] = (char)('0' + value % 10);
-        value /= 10;
-    } while (value);
-    while (n) {
-        *(volatile uint8_t *)0xE0000000u = (uint8_t)text[--n];
-    }
-    *(volatile uint8_t *)0xE0000000u = '\n';
+    stimulus_number(value);
+    stimulus_character('\n');
 }

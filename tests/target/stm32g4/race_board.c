@@ -4,6 +4,7 @@
 #include "race.h"
 
 #include "hal_watchdog.h"
+#include "stimulus.h"
 #include "stm32g4/board.h"
 
 #define INTERRUPTS 8000
@@ -25,21 +26,14 @@ void race_round(void) {
     race_delay(4 * race_random(&sequence));
 }
 
-static void print(unsigned number) {
-    if (number > 9) {
-        print(number / 10);
-    }
-    *(volatile uint8_t *)0xE0000000u = (uint8_t)('0' + number % 10);
-}
-
 void race_report(hal_t *hal, const uint16_t counts[RACE_COUNTS]) {
     (void)hal;
     if (counts[0] < INTERRUPTS) {
         return;
     }
     for (unsigned i = 0; i < RACE_COUNTS; i++) {
-        print(counts[i]);
-        *(volatile uint8_t *)0xE0000000u = ' ';
+        stimulus_number(counts[i]);
+        stimulus_character(' ');
     }
     __asm__ volatile("cpsid i\n movs r0, #0\n bkpt 0" ::: "r0");
 }

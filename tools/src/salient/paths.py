@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from salient.errors import UsageError, cannot_write, close_names, shown
+from salient.guard import removes
 
 _DATA = Path(__file__).resolve().parent / "data"
 IS_WHEEL = _DATA.is_dir()
@@ -93,10 +94,16 @@ def keep_text(path: Path, text: str) -> None:
     sees a whole file or none."""
     if path.exists() and path.read_text(encoding="utf-8") == text:
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, text.encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes a file and its folder: another process sees the whole file or none, whatever ends this one. OSError."""
     temporary = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
+    removes(temporary)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

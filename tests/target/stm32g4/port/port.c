@@ -4,6 +4,7 @@
  * Runs of the program, each ended by a reset: one while a word of the memory is programmed, which tears it; the
  * watchdog's after a double error in the program has halted it; one by software; the watchdog's after its last kick.
  */
+#include "../stimulus.h"
 #include "check.h"
 #include "hal_adc.h"
 #include "hal_encoder.h"
@@ -32,17 +33,9 @@ volatile uint32_t periods, wanted, written_start, missed, resumed;
 volatile uint32_t deferred_calls, pre_empted, can_pre_empted;
 volatile bool sweep_done, masked;
 
-/* The code in decimal on the first stimulus port: a process has but 8 bits for it. */
-static void print(unsigned code) {
-    if (code > 9) {
-        print(code / 10);
-    }
-    *(volatile uint8_t *)0xE0000000u = (uint8_t)('0' + code % 10);
-}
-
 void leave(int code) {
     if (code) {
-        print((unsigned)code);
+        stimulus_number((uint32_t)code); /* a process has but 8 bits for it */
         code = 1;
     }
     register int result __asm__("r0") = code;

@@ -15,12 +15,12 @@ from typing import Any
 from salient.bench import programs
 from salient.bench.bench import Bench
 from salient.builder import build_preset
-from salient.config import BOARD_BUILD, BenchConfig
+from salient.config import BOARD_BUILD
 from salient.errors import RunFailed, UsageError
 from salient.experiments.campaign.failure import TELEMETRY_PERIOD_MS, send_frames
 from salient.experiments.campaign.machines import files
 from salient.experiments.campaign.runner import ALL_EVENTS, run_world, world
-from salient.machine.path import stated_conditions
+from salient.machine.cache import bench_config
 from salient.paths import BUILD, ROOT, build_lock, from_root
 
 _RECORD_STEP_NS = 10_000
@@ -72,10 +72,10 @@ def board_hashes(seed: int) -> dict[str, Any]:
         machine = next(path for path in files() if path.stem == described["machine"])
         for name, options in zip(("bench", "on_target"), pair(programs.BOARD_CLOCK_MHZ), strict=True):
             recording = Path(temporary) / f"{name}.npy"
-            config = BenchConfig(machine=str(machine), controller=described["controller"], seed=seed,
-                                 initial_angle_deg=described["initial_angle_deg"],
-                                 telemetry_period_ms=TELEMETRY_PERIOD_MS, record=recording,
-                                 record_step_ns=_RECORD_STEP_NS, **stated_conditions(machine), **options)
+            config = bench_config({"machine": str(machine), "controller": described["controller"], "seed": seed,
+                                   "initial_angle_deg": described["initial_angle_deg"],
+                                   "telemetry_period_ms": TELEMETRY_PERIOD_MS, "record": recording,
+                                   "record_step_ns": _RECORD_STEP_NS, **options})
             try:
                 with Bench(config, f"unix:{temporary}/{name}.sock") as bench:
                     send_frames(bench, lines)

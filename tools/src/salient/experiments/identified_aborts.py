@@ -52,7 +52,7 @@ from salient.identify.result import Result, write_machine
 from salient.identify.sequence import Sequence as Experiments
 from salient.machine.cache import bench_config
 from salient.machine.file import load_machine
-from salient.machine.path import machine_path, stated_conditions
+from salient.machine.path import machine_path
 from salient.machine.scaling import scaling_of
 from salient.paths import OUT
 
@@ -252,8 +252,7 @@ def run_one(abort: Abort) -> dict[str, Any]:
         before = contents(out.parent)
         config = bench_config({"machine": str(path), "controller": "salient", "pace": "lockstep", "record": recording,
                                "telemetry_period_ms": TELEMETRY_PERIOD_MS, "record_step_ns": 2 * period_ns,
-                               "initial_angle_deg": random.Random(abort.seed).uniform(0.0, 360.0),
-                               **stated_conditions(path)})
+                               "initial_angle_deg": random.Random(abort.seed).uniform(0.0, 360.0)})
         can = f"unix:{folder}/bus"
         with EmulatorProcess(config, can):
             if abort.loaded:

@@ -37,7 +37,7 @@ from salient.identify.sequence import Findings
 from salient.identify.sequence import Sequence as Experiments
 from salient.machine.cache import bench_config
 from salient.machine.file import load_machine
-from salient.machine.path import machine_path, stated_conditions
+from salient.machine.path import machine_path
 from salient.machine.scaling import scaling_of
 from salient.paths import OUT
 
@@ -124,7 +124,7 @@ def run_one(start: Start) -> dict[str, Any]:
     machine = load_machine(path)
     data = scaling_of(path, machine).data
     config = bench_config({"machine": str(path), "controller": "salient", "telemetry_period_ms": TELEMETRY_PERIOD_MS,
-                           **stated_conditions(path), "encoder_bits": start.bits, "seed": start.seed,
+                           "encoder_bits": start.bits, "seed": start.seed,
                            "initial_angle_deg": start.initial_deg})
     result: dict[str, Any] = {"verdict": "refused", "why": "", "error": None, "time_s": None}
     with tempfile.TemporaryDirectory() as socket:

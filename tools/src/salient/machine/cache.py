@@ -9,7 +9,6 @@ kept, under the hash of the drive's DBC, which a drive sends: its frames can be 
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -17,10 +16,18 @@ from typing import Any
 
 from salient.config import DEFAULTS, BenchConfig
 from salient.errors import UsageError, close_names
-from salient.guard import removes
 from salient.machine.content import content_of, map_of
 from salient.machine.path import MachineError, machine_path, stated_conditions
-from salient.paths import BUILD, DRIVE_DBC, EXAMPLE_MACHINES, IS_WHEEL, MACHINES, PARAMETERS, PYTHON_PACKAGES
+from salient.paths import (
+    BUILD,
+    DRIVE_DBC,
+    EXAMPLE_MACHINES,
+    IS_WHEEL,
+    MACHINES,
+    PARAMETERS,
+    PYTHON_PACKAGES,
+    write_whole,
+)
 
 FOLDER = BUILD / "machines"
 IMAGE_SUFFIX = ".machine"
@@ -146,15 +153,7 @@ def _generator() -> bytes:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Another process sees the whole file or none."""
-    temporary = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
-    removes(temporary)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_whole(path, content)
     except OSError as error:
         raise UsageError(f"{path.parent}: {error.strerror}; machine images are kept there") from None
