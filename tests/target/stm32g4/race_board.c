@@ -9,8 +9,8 @@
 
 #define INTERRUPTS 8000
 
-/* The patterns take longer than a period of 40 kHz. */
-const uint32_t board_control_rate_hz = 20000;
+/* The patterns of both interrupts take most of a period of 20 kHz, and would starve the background. */
+const uint32_t board_control_rate_hz = 10000;
 const uint16_t board_trip_counts = 4095;
 const uint8_t board_encoder_bits = 17;
 
