@@ -80,6 +80,19 @@ void can_bus_rejoin(can_bus_t *bus, unsigned drive, uint64_t now_ns) {
     request_start(bus, drive_line(bus, &bus->drives[drive]));
 }
 
+void can_bus_reset_drive(can_bus_t *bus, unsigned drive, uint64_t now_ns) {
+    can_node_t *node = &bus->drives[drive].node;
+    can_line_t *line = drive_line(bus, &bus->drives[drive]);
+    const bool under_way = line->state != CAN_LINE_IDLE;
+    bus->drives[drive].errors_set = false;
+    can_node_reset(node, under_way);
+    if (under_way) {
+        can_line_fall_silent(line, node, (unsigned)bits_between(bus, line->frame_start_ns, now_ns));
+        line->next_event_ns = bits_later(bus, line->frame_start_ns, line->bits);
+    }
+    bus->start_requested = true;
+}
+
 static can_bus_client_t *find_client(const can_bus_t *bus, uint32_t number) {
     for (unsigned i = 0; i < bus->client_count; ++i) {
         if (bus->clients[i]->number == number) {
@@ -372,7 +385,9 @@ static void transmission_failed(can_bus_t *bus, can_line_t *line, can_node_t *no
 static void count_reception(can_bus_t *bus, const can_line_t *line, bool disturbed) {
     can_node_t *node;
     FOR_EACH_NODE(bus, line, node) {
-        if (node->bus_off || (!disturbed && node->receive_errors == 0) || transmits(line, node)) {
+        const bool integrates = node->integrates;
+        node->integrates = false;
+        if (node->bus_off || integrates || (!disturbed && node->receive_errors == 0) || transmits(line, node)) {
             continue;
         }
         if (disturbed) {
@@ -419,7 +434,8 @@ static void deliver(can_bus_t *bus, const can_line_t *line, can_bus_delivery_t *
         return;
     }
     for (unsigned i = 0; i < bus->drive_count; ++i) {
-        const bool listens = !bus->drives[i].disconnected && !bus->drives[i].node.bus_off;
+        const can_node_t *node = &bus->drives[i].node;
+        const bool listens = !bus->drives[i].disconnected && !node->bus_off && !node->integrates;
         delivery->to_drives |= (uint8_t)((listens && !(senders >> i & 1u)) << i);
     }
 }

@@ -64,7 +64,7 @@ typedef struct {
 typedef struct {
     /* Time at which can_bus_step is due, CAN_BUS_NEVER while nothing is to be sent. */
     uint64_t next_event_ns;
-    /* A frame was queued on an idle bus: can_bus_start is due. */
+    /* A frame was queued on an idle bus, or a line has changed: can_bus_start is due. */
     bool start_requested;
 
     /* Settings. A change of `babble` requires can_bus_babble. */
@@ -97,6 +97,10 @@ void can_bus_close(can_bus_t *bus);
 /* A drive puts a frame into a free mailbox; false when all three are taken, or in bus-off. A mailbox is free again when
  * its frame is complete. */
 bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *frame);
+
+/* Reset of a drive's controller at now_ns: error active, mailboxes empty. A frame that it transmits ends with an error;
+ * one that another node transmits it does not receive. */
+void can_bus_reset_drive(can_bus_t *bus, unsigned drive, uint64_t now_ns);
 
 /* A drive leaves bus-off once 128 times 11 recessive bits have passed from now_ns on. */
 void can_bus_rejoin(can_bus_t *bus, unsigned drive, uint64_t now_ns);

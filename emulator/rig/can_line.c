@@ -1,5 +1,7 @@
 #include "rig/can_line.h"
 
+#define STUFF_ERROR_BITS 6 /* equal ones */
+#define ERROR_FLAG_BITS 6
 #define CRC_MARGIN_BITS 6 /* a disturbed bit is not among the last of the CRC: its error flag ends in stuffed bits */
 
 /* The present frame ends with an error flag of `flag_bits` after `bits` bits. */
@@ -91,5 +93,24 @@ void can_line_plan_frame(can_line_t *line, bool acknowledged, const can_length_t
         line->acknowledge_error = true;
     } else if (mailbox->fault == CAN_FAULT_DUPLICATED) {
         line->bits_to_idle += CAN_WIRE_LAST_BIT_FLAG_BITS + CAN_WIRE_ERROR_DELIMITER_BITS;
+    }
+}
+
+void can_line_fall_silent(can_line_t *line, const can_node_t *node, unsigned bits) {
+    unsigned index = 0;
+    while (index < line->transmitters && line->transmitter[index].node != node) {
+        ++index;
+    }
+    if (index == line->transmitters) {
+        return;
+    }
+    const bool sends = index < line->remaining;
+    line->remaining -= sends;
+    for (--line->transmitters; index < line->transmitters; ++index) {
+        line->transmitter[index] = line->transmitter[index + 1];
+    }
+    if (sends && line->remaining == 0) {
+        line->acknowledge_error = false;
+        plan_error(line, bits + STUFF_ERROR_BITS, ERROR_FLAG_BITS);
     }
 }

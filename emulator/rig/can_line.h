@@ -36,4 +36,8 @@ typedef struct {
 void can_line_plan_frame(can_line_t *line, bool acknowledged, const can_length_t *lengths, can_faults_t *faults,
                          can_wire_t *wires);
 
+/* A node falls silent after `bits` bits of the frame that is under way. When no other node sends it to the end, the
+ * frame ends with an error: the receivers see a stuff error, an error flag follows. */
+void can_line_fall_silent(can_line_t *line, const can_node_t *node, unsigned bits);
+
 #endif

@@ -93,12 +93,28 @@ void can_node_complete(can_node_t *node, can_mailbox_t *mailbox) {
     refill(node);
 }
 
-static void go_bus_off(can_node_t *node) {
-    node->bus_off = true;
-    node->rejoins = false;
+static void empty_mailboxes(can_node_t *node) {
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         node->mailbox[i].taken = false;
     }
+}
+
+static void go_bus_off(can_node_t *node) {
+    node->bus_off = true;
+    node->rejoins = false;
+    empty_mailboxes(node);
+}
+
+static void become_error_active(can_node_t *node) {
+    node->bus_off = node->rejoins = false;
+    node->transmit_errors = node->receive_errors = 0;
+    node->suspended_till_ns = 0;
+}
+
+void can_node_reset(can_node_t *node, bool under_way) {
+    empty_mailboxes(node);
+    become_error_active(node);
+    node->integrates = under_way;
 }
 
 void can_node_transmitted(can_node_t *node) {
@@ -147,8 +163,6 @@ void can_node_count_recessive(can_node_t *node, uint64_t sequences) {
         node->sequences_left -= (unsigned)sequences;
         return;
     }
-    node->bus_off = node->rejoins = false;
-    node->transmit_errors = node->receive_errors = 0;
-    node->suspended_till_ns = 0;
+    become_error_active(node);
     refill(node);
 }

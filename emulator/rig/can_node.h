@@ -26,13 +26,14 @@ typedef struct {
 
 typedef struct {
     /* Error confinement. */
-    unsigned transmit_errors; /* up to 256 and a little more, which is bus-off */
+    unsigned transmit_errors; /* up to 256 and a little more, which is bus-off (reported as 256) */
     unsigned receive_errors;  /* 0..128 */
     bool bus_off;
     bool rejoins;               /* counts recessive bits to leave bus-off */
     unsigned sequences_left;    /* while it rejoins */
     uint64_t rejoins_from_ns;   /* bits before do not count */
     uint64_t suspended_till_ns; /* suspend transmission of an error-passive transmitter */
+    bool integrates;            /* after a reset: takes no part in the frame that is under way */
 
     can_mailbox_t mailbox[HAL_CAN_MAILBOXES];
     uint64_t requests;
@@ -75,6 +76,9 @@ void can_node_transmitted(can_node_t *node);
 void can_node_transmit_error(can_node_t *node);
 void can_node_received(can_node_t *node);
 void can_node_receive_error(can_node_t *node);
+
+/* Reset of its controller: error active, mailboxes empty. under_way: a frame is, on its line. */
+void can_node_reset(can_node_t *node, bool under_way);
 
 /* Sets the transmit error counter; above 255 the node is bus-off. */
 void can_node_set_transmit_errors(can_node_t *node, unsigned errors);

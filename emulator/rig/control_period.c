@@ -42,6 +42,7 @@ bool control_period_reset_drive(control_period_t *period, hal_reset_cause_t caus
     }
     plant_advance(period->plant, period->board->time_ns);
     board_reset(period->board, cause);
+    can_bus_reset_drive(period->shared_bus.bus, period->board->bus_drive, period->board->time_ns);
     period->interrupt_end_ns = 0;
     memory_flips_drive_reset(&period->flips);
     period->scheduler->due_ns[EVENT_CONTROL] = period->scheduler->due_ns[EVENT_CURRENT_HOLD] =

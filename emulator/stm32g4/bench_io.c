@@ -17,10 +17,6 @@ static board_t *board;
 static wiring_t wiring;
 static can_mailbox_t *mailbox[3];
 static uint64_t mailbox_request[3];
-static struct {
-    bool waits; /* for a mailbox of the bench, which has frames from before a reset of the drive */
-    hal_can_frame_t frame;
-} waiting[3];
 static uint32_t encoder_at; /* count whose levels the pins have */
 
 /* --- Analogue --- */
@@ -107,11 +103,15 @@ void bench_io_encoder(void) {
 
 /* --- Bus --- */
 
-static bool hand_over(unsigned buffer, const hal_can_frame_t *frame) {
+static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
+    (void)context;
+    hal_can_frame_t copy = {
+        .identifier = frame->identifier, .extended = frame->extended, .remote = frame->remote, .length = frame->length};
+    memcpy(copy.data, frame->data, sizeof copy.data);
     can_node_t *node = &board->bus->drives[board->bus_drive].node;
     mailbox[buffer] = NULL;
-    if (!board_can_transmit(board, frame)) {
-        return false;
+    if (!board_can_transmit(board, &copy)) {
+        return; /* bus-off */
     }
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         can_mailbox_t *each = &node->mailbox[i];
@@ -120,24 +120,11 @@ static bool hand_over(unsigned buffer, const hal_can_frame_t *frame) {
         }
     }
     mailbox_request[buffer] = mailbox[buffer] ? mailbox[buffer]->request : 0;
-    return true;
-}
-
-static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
-    (void)context;
-    waiting[buffer].frame = (hal_can_frame_t){
-        .identifier = frame->identifier, .extended = frame->extended, .remote = frame->remote, .length = frame->length};
-    memcpy(waiting[buffer].frame.data, frame->data, sizeof waiting[buffer].frame.data);
-    waiting[buffer].waits = !hand_over(buffer, &waiting[buffer].frame);
 }
 
 static bool pending(void *context, unsigned buffer) {
     (void)context;
-    if (waiting[buffer].waits) {
-        waiting[buffer].waits = !hand_over(buffer, &waiting[buffer].frame);
-    }
-    return waiting[buffer].waits ||
-           (mailbox[buffer] && mailbox[buffer]->taken && mailbox[buffer]->request == mailbox_request[buffer]);
+    return mailbox[buffer] && mailbox[buffer]->taken && mailbox[buffer]->request == mailbox_request[buffer];
 }
 
 static void cancel(void *context, unsigned buffer) {
@@ -285,7 +272,6 @@ void bench_io_reset(void) {
     set(wiring.encoder_index, false);
     bench_io_lines();
     memset(mailbox, 0, sizeof mailbox);
-    memset(waiting, 0, sizeof waiting);
 }
 
 void bench_io_open(board_t *of, const wiring_t *pins) {

@@ -442,6 +442,58 @@ TEST_F(CanBus, BusOffEndsOnRequestAfter128Times11RecessiveBits) {
     EXPECT_TRUE(transmit(frame(0x102)));
 }
 
+TEST_F(CanBus, ResetOfADriveCutsItsFrameOffWithAnErrorAndEmptiesItsMailboxes) {
+    for (unsigned cut = 1; cut < bits(frame(0x100, {1, 2, 3, 4})); ++cut) {
+        restart();
+        for (uint32_t identifier : {0x100, 0x101, 0x102}) {
+            transmit(frame(identifier, {1, 2, 3, 4}));
+        }
+        push(frame(0x200));
+        can_bus_start(&bus, 0);
+        can_bus_reset_drive(&bus, 0, cut * US);
+        can_bus_start(&bus, cut * US);
+        ASSERT_TRUE(transmit(frame(0x300)) && transmit(frame(0x301)) && transmit(frame(0x302))) << "all are free";
+        const auto deliveries = run();
+        ASSERT_EQ(deliveries.size(), 4u) << cut;
+        const uint64_t error_ns = (cut + 6 + 6 + 8 + 3) * US;
+        EXPECT_EQ(deliveries[0].second.frame.identifier, 0x200u);
+        EXPECT_EQ(deliveries[0].first, error_ns + bits(frame(0x200)) * US);
+        EXPECT_EQ(deliveries[0].second.to_drives, 1u);
+        EXPECT_EQ(deliveries[3].second.frame.identifier, 0x302u);
+        EXPECT_EQ(client(0).transmit_errors + bus.drives[0].node.transmit_errors, 0u);
+        EXPECT_EQ(bus.drives[0].node.receive_errors, 0u) << "it was not there";
+    }
+}
+
+TEST_F(CanBus, ResetOfADriveEndsBusOffAndDoesNotReceiveTheFrameUnderWay) {
+    can_bus_set_transmit_errors(&bus, 0, 256);
+    push(frame(0x200));
+    push(frame(0x201));
+    can_bus_start(&bus, 0);
+    can_bus_reset_drive(&bus, 0, 10 * US);
+    can_bus_start(&bus, 10 * US);
+    EXPECT_FALSE(bus.drives[0].node.bus_off);
+    EXPECT_EQ(bus.drives[0].node.transmit_errors, 0u);
+    const auto deliveries = run();
+    ASSERT_EQ(deliveries.size(), 2u);
+    EXPECT_EQ(deliveries[0].first, bits(frame(0x200)) * US) << "the frame of another node ends as it would";
+    EXPECT_EQ(deliveries[0].second.to_drives, 0u);
+    EXPECT_EQ(deliveries[1].second.to_drives, 1u);
+}
+
+TEST_F(CanBus, ResetOfOneOfTwoSendersOfAFrameLeavesItToTheOther) {
+    transmit(frame(0x100, {1, 2}));
+    push(frame(0x100, {1, 2}));
+    can_bus_start(&bus, 0);
+    can_bus_reset_drive(&bus, 0, 30 * US);
+    can_bus_start(&bus, 30 * US);
+    const auto deliveries = run();
+    ASSERT_EQ(deliveries.size(), 1u);
+    EXPECT_EQ(deliveries[0].first, bits(frame(0x100, {1, 2})) * US);
+    EXPECT_FALSE(deliveries[0].second.from_drive);
+    EXPECT_TRUE(deliveries[0].second.from_client);
+}
+
 TEST_F(CanBus, OnAFullBusEachFrameEndsWithElevenRecessiveBits) {
     can_bus_set_transmit_errors(&bus, 0, 256);
     for (unsigned i = 0; i < 300; ++i) {
