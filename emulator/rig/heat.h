@@ -4,8 +4,8 @@
  *
  *   C dT / dt = P - (T - T_ambient) / R        C, R: thermal_data_t, of the machine file
  *
- * in explicit steps of a millisecond and at most a control period more, whose energies are exact. A body may be held at
- * a temperature instead. The resistance of a winding in the plant follows its temperature when that has changed by
+ * in explicit steps of a millisecond, the first of half one, and at most a control period more, whose energies are
+ * exact. A body may be held at a temperature instead. The resistance of a winding in the plant follows its temperature when that has changed by
  * 1 K, which is 0.4 % of the resistance: a run that heats its windings by less has a constant resistance.
  *
  * A sensor has the temperature of its body at the end of the step, and the line of hal_adc.h at 12 bits.
@@ -39,7 +39,7 @@ typedef struct {
 /* Every body at ambient temperature. Keeps plant and codes, of HAL_ADC_TEMPERATURES sensors. */
 void heat_init(heat_t *heat, plant_t *plant, uint16_t *codes);
 
-/* Takes a step when a millisecond has passed since the last one, at the time of the plant. */
+/* Takes a step when its time has passed since the last one, at the time of the plant. */
 void heat_step(heat_t *heat);
 
 /* Temperature of the hottest winding and of the hottest switches. */
