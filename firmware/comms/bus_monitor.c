@@ -3,6 +3,7 @@
 #include <assert.h>
 
 #include "comms/counter.h"
+#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "drive_enumerations.h"
 #include "drive_telemetry.h"
@@ -61,7 +62,9 @@ COLD void bus_monitor_step(bus_monitor_t *monitor, hal_t *hal, uint32_t time_us)
 COLD void bus_monitor_check(bus_monitor_t *monitor, const hal_can_frame_t *frame, uint32_t time_us) {
     bool own = frame->identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID;
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
-        own = own || frame->identifier == drive_telemetry_messages[i].identifier;
+        const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
+        own = own ||
+              (frame->identifier == message->identifier && machine_tables.phases > message->phases_above);
     }
     if (!own || frame->extended || frame->remote) {
         return;

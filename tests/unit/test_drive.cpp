@@ -2355,7 +2355,9 @@ TEST_F(Drive, no_other_identifier_length_or_flag_is_an_identifier_conflict_or_ch
                                              DRIVE_PARAMETER_REQUEST_FRAME_ID};
     std::vector<uint32_t> own = {DRIVE_PARAMETER_RESPONSE_FRAME_ID};
     for (const auto &message : drive_telemetry_messages) {
-        own.push_back(message.identifier);
+        if (machine_tables.phases > message.phases_above) {
+            own.push_back(message.identifier);
+        }
     }
     const auto contains = [](const std::vector<uint32_t> &list, uint32_t identifier) {
         return std::find(list.begin(), list.end(), identifier) != list.end();

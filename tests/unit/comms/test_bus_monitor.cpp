@@ -6,6 +6,7 @@
 extern "C" {
 #include "comms/bus_monitor.h"
 #include "drive_codec.h"
+#include "drive_telemetry.h"
 }
 
 struct hal {
@@ -133,6 +134,18 @@ TEST_F(BusMonitor, neither_a_remote_nor_an_extended_frame_nor_another_identifier
         bus_monitor_check(&monitor, &frame, time_us);
         EXPECT_EQ(monitor.conflict, kind == 3) << kind;
         EXPECT_EQ(monitor.foreign_count, kind == 3) << kind;
+    }
+}
+
+// A machine of up to four phases has neither the message nor its identifier. [SR-37]
+TEST_F(BusMonitor, identifier_of_a_message_of_more_phases_than_the_machine_has_is_no_conflict) {
+    for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
+        const drive_telemetry_message_t &message = drive_telemetry_messages[i];
+        hal_can_frame_t frame{};
+        frame.identifier = message.identifier;
+        bus_monitor_init(&monitor, time_us);
+        bus_monitor_check(&monitor, &frame, time_us);
+        EXPECT_EQ(monitor.conflict, message.identifier != DRIVE_PHASES_E_F_FRAME_ID) << message.identifier;
     }
 }
 
