@@ -32,6 +32,9 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame);
  * is received or transmitted, and frames in the mailboxes are lost. */
 typedef enum { HAL_CAN_ERROR_ACTIVE, HAL_CAN_ERROR_PASSIVE, HAL_CAN_BUS_OFF } hal_can_error_state_t;
 
+/* Transmit errors that are reported in bus-off: the counter of a controller has 8 bits, and the state is the ninth. */
+#define HAL_CAN_TRANSMIT_ERRORS_BUS_OFF 256u
+
 typedef struct {
     hal_can_error_state_t state;
     uint16_t transmit_errors; /* transmit error counter */

@@ -180,7 +180,7 @@ void board_can_status(const board_t *board, hal_can_status_t *status) {
         .state = node->bus_off               ? HAL_CAN_BUS_OFF
                  : can_node_is_passive(node) ? HAL_CAN_ERROR_PASSIVE
                                              : HAL_CAN_ERROR_ACTIVE,
-        .transmit_errors = (uint16_t)node->transmit_errors,
+        .transmit_errors = (uint16_t)(node->bus_off ? HAL_CAN_TRANSMIT_ERRORS_BUS_OFF : node->transmit_errors),
         .receive_errors = (uint16_t)node->receive_errors,
         .transmitting = can_node_backlog(node) > 0,
     };

@@ -67,11 +67,16 @@ static void unrenewed_init(void) {
     TIM_DIER(TIM3_BASE) = TIM_DIER_CC1DE | TIM_DIER_CC2DE;
 }
 
+static uint32_t lines_high(void) {
+    return (GPIO_IDR(GPIOB_BASE) & (LINE_STO_1 | LINE_STO_2)) | (GPIO_IDR(GPIOC_BASE) & LINE_FAULT);
+}
+
 static void lines_init(void) {
     SYSCFG_EXTICR3 = PUT(SYSCFG_EXTICR3_EXTI10, EXTI_PORT_C);
     SYSCFG_EXTICR4 = PUT(SYSCFG_EXTICR4_EXTI12, EXTI_PORT_B) | PUT(SYSCFG_EXTICR4_EXTI13, EXTI_PORT_B);
     EXTI_FTSR1 |= LINES;
     EXTI_IMR1 |= LINES;               /* the latch; no interrupt of the NVIC is enabled for it */
+    EXTI_SWIER1 = LINES & ~lines_high(); /* one that fell before the reset is a cause also when it has risen again */
     SYSCFG_CFGR2 |= SYSCFG_CFGR2_CLL; /* a lock-up of the processor is a break, too */
 }
 
@@ -113,10 +118,9 @@ uint32_t break_causes(void) {
 
 /* A cause that is still there sets its flag again; the edge of a line that is still low would not come again. */
 void break_clear(void) {
-    const uint32_t high = (GPIO_IDR(GPIOB_BASE) & (LINE_STO_1 | LINE_STO_2)) | (GPIO_IDR(GPIOC_BASE) & LINE_FAULT);
     TIM_CNT(TIM3_BASE) = 0;
     TIM_SR(TIM3_BASE) = ~(TIM_SR_CC1IF | TIM_SR_CC2IF);
-    EXTI_PR1 = high;
+    EXTI_PR1 = lines_high();
     TIM_SR(TIM1_BASE) = ~(TIM_SR_BIF | TIM_SR_B2IF | TIM_SR_SBIF);
     TIM_SR(TIM8_BASE) = ~(TIM_SR_BIF | TIM_SR_B2IF | TIM_SR_SBIF);
 }

@@ -23,7 +23,6 @@ _Static_assert(PRESCALER *QUANTA *BOARD_CAN_BIT_RATE == BOARD_CLOCK_HZ && PRESCA
 #define WORD0_STANDARD_ID BITS(18, 11)
 #define WORD0_EXTENDED_ID BITS(0, 29)
 #define WORD1_LENGTH BITS(16, 4)
-#define TRANSMIT_ERRORS_BUS_OFF 256u
 #define RECEIVE_ERRORS_PASSIVE 128u
 
 void can_init(void) {
@@ -123,7 +122,7 @@ void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
         .state = off                    ? HAL_CAN_BUS_OFF
                  : state & FDCAN_PSR_EP ? HAL_CAN_ERROR_PASSIVE
                                         : HAL_CAN_ERROR_ACTIVE,
-        .transmit_errors = (uint16_t)(off ? TRANSMIT_ERRORS_BUS_OFF : GET(FDCAN_ECR_TEC, errors)),
+        .transmit_errors = (uint16_t)(off ? HAL_CAN_TRANSMIT_ERRORS_BUS_OFF : GET(FDCAN_ECR_TEC, errors)),
         .receive_errors = (uint16_t)(errors & FDCAN_ECR_RP ? RECEIVE_ERRORS_PASSIVE : GET(FDCAN_ECR_REC, errors)),
         .transmitting = !off && FDCAN_TXBRP != 0,
     };
