@@ -141,6 +141,9 @@ void inertia_restart(const inertia_parameters_t *parameters, const load_observer
 COLD void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia) {
     limit_shift(inertia);
     set_base(parameters, model, inertia);
+}
+
+COLD void inertia_tune_laws(inertia_t *inertia) {
     set_laws(inertia);
 }
 

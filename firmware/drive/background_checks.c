@@ -17,7 +17,7 @@
  * coarse encoder the speed reference of that error stays, though nothing is to turn. */
 COLD static bool holds_position(const control_state_t *control, const control_parameters_t *parameters) {
     const position_status_t *place = &control->position.status;
-    const int64_t counts = 4 * (int64_t)parameters->encoder_middle, window = parameters->position.window >> 16;
+    const int64_t counts = 4 * (int64_t)parameters->encoder_middle, window = parameters->position.law.window >> 16;
     const int64_t most = counts > window ? counts : window;
     return place->active && place->speed_reference_q22 == 0 && place->error <= most && place->error >= -most;
 }

@@ -40,12 +40,14 @@ COLD static void configure(drive_t *drive, hal_t *hal) {
         drive->control_parameters = control_parameters;
         control_prepare(&drive->control_parameters, &drive->control);
     } else {
-        configure_tune(&drive->control_parameters, &control_parameters, CONFIGURE_TUNE_SPEED);
-        deferred_tune(&drive->control_parameters, &drive->control);
-        for (unsigned part = CONFIGURE_TUNE_SPEED + 1; part < CONFIGURE_TUNE_PARTS; part++) {
+        for (unsigned part = 0; part < CONFIGURE_TUNE_PARTS + DEFERRED_TUNE_PARTS; part++) {
             hal_critical_leave(hal);
             hal_critical_enter(hal);
-            configure_tune(&drive->control_parameters, &control_parameters, part);
+            if (part < CONFIGURE_TUNE_PARTS) {
+                configure_tune(&drive->control_parameters, &control_parameters, part);
+            } else {
+                deferred_tune(&drive->control_parameters, &drive->control, part - CONFIGURE_TUNE_PARTS);
+            }
         }
     }
     drive->applied_revision = drive->parameters.revision;

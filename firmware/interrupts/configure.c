@@ -358,11 +358,16 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
     case CONFIGURE_TUNE_TORQUE:
         parameters->duty.pid = tuned->duty.pid;
         parameters->predictive.flux = tuned->predictive.flux;
-        parameters->conduction = tuned->conduction;
         parameters->misalignment = tuned->misalignment;
         return;
+    case CONFIGURE_TUNE_CONDUCTION:
+        parameters->conduction = tuned->conduction;
+        return;
     case CONFIGURE_TUNE_POSITION:
-        parameters->position = tuned->position;
+        parameters->position.law = tuned->position.law;
+        return;
+    case CONFIGURE_TUNE_POSITION_PLAN:
+        parameters->position.plan = tuned->position.plan;
         return;
     default: { /* of the observer */
         const unsigned stage = part - CONFIGURE_TUNE_FIRST_STAGE;

@@ -27,19 +27,20 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
                                        uint32_t timer_clock_hz);
 
 /* Parts in which a run takes over tuned parameters, so that no interrupt waits for all of them: laws of speed and load,
- * laws of torque, laws of position, then each stage of the observer's bandwidth. */
+ * laws of torque, their windows, law and limits of position, then each stage of the observer's bandwidth. */
 enum {
     CONFIGURE_TUNE_SPEED,
     CONFIGURE_TUNE_TORQUE,
+    CONFIGURE_TUNE_CONDUCTION,
     CONFIGURE_TUNE_POSITION,
+    CONFIGURE_TUNE_POSITION_PLAN,
     CONFIGURE_TUNE_FIRST_STAGE,
     CONFIGURE_TUNE_PARTS = CONFIGURE_TUNE_FIRST_STAGE + OBSERVER_BANDWIDTH_STAGES
 };
 
 /* Takes over a part from the control parameters of a set that differs in nothing else than tunable parameters
  * (parameters.h): every law that depends on one of them, as a whole, so that no member can be forgotten; members that
- * depend on others are equal in both. After CONFIGURE_TUNE_SPEED follows deferred_tune() in the same critical section.
- * [background, in a critical section] */
+ * depend on others are equal in both. [background, in a critical section] */
 void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part);
 
 #endif

@@ -300,9 +300,13 @@ static void set_speed_law(const control_parameters_t *parameters, deferred_t *de
     deferred->speed_smc.epsilon_q31 = fixed_max(epsilon_q31, SPEED_SMC_EPSILON_MIN_Q31);
 }
 
-COLD void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
+COLD void deferred_tune(const control_parameters_t *parameters, control_state_t *state, unsigned part) {
     deferred_t *deferred = &state->deferred;
-    inertia_tune(&parameters->inertia, &parameters->observer, &deferred->inertia);
+    if (part == DEFERRED_TUNE_INERTIA) {
+        inertia_tune(&parameters->inertia, &parameters->observer, &deferred->inertia);
+        return;
+    }
+    inertia_tune_laws(&deferred->inertia);
     deferred->speed_smc = parameters->speed_smc;
     if (parameters->torque_law == TORQUE_LAW_PREDICTIVE) {
         set_speed_law(parameters, deferred);

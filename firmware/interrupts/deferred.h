@@ -50,9 +50,12 @@ void deferred_compute(const control_parameters_t *parameters, control_state_t *s
  * [control interrupt, or background in a critical section] */
 void deferred_reset_run(control_state_t *state);
 
-/* Makes the speed law follow changed parameters; no other state follows from tunable ones (parameters.h). [background,
- * in a critical section] */
-void deferred_tune(const control_parameters_t *parameters, control_state_t *state);
+/* Parts in which the speed law follows changed parameters, so that no interrupt waits for both. */
+enum { DEFERRED_TUNE_INERTIA, DEFERRED_TUNE_LAWS, DEFERRED_TUNE_PARTS };
+
+/* Makes the speed law follow changed parameters, all parts in their order; no other state follows from tunable ones
+ * (parameters.h). [background, in a critical section] */
+void deferred_tune(const control_parameters_t *parameters, control_state_t *state, unsigned part);
 
 /* Resets with the observer: statistics of the innovation. [control interrupt] */
 void deferred_reset_observer(control_state_t *state);

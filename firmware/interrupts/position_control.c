@@ -10,7 +10,7 @@
 /* [SR-09] */
 static int32_t torque_limit_q24(const control_parameters_t *parameters, const control_state_t *state) {
     const int32_t limit_q24 = state->torque_limit_q24;
-    return position_seeks_stop(&state->position) ? fixed_min(limit_q24, parameters->position.homing_torque_q24)
+    return position_seeks_stop(&state->position) ? fixed_min(limit_q24, parameters->position.law.homing_torque_q24)
                                                  : limit_q24;
 }
 
@@ -19,7 +19,7 @@ NOINLINE static void control_position(const control_parameters_t *parameters, co
                                       deferred_results_t *results) {
     deferred_t *deferred = &state->deferred;
     const position_output_t output =
-        position_step(&parameters->position, &state->position, &state->position_command, sample);
+        position_step(&parameters->position.law, &state->position, &state->position_command, sample);
     const int32_t limit_q24 = torque_limit_q24(parameters, state);
     const command_t command = {
         .request = COMMAND_RUN, .mode = DRIVE_MODE_SPEED, .speed_reference_q22 = output.speed_q22};
@@ -46,7 +46,7 @@ NOINLINE static bool begin_step(const control_parameters_t *parameters, control_
     const position_sample_t sample = {
         .encoder_angle = input->encoder_angle,
         .angle = input->angle,
-        .speed = (input->speed_q22 >> 4) * (parameters->position.per_speed_q16 >> 4) >> 8,
+        .speed = (input->speed_q22 >> 4) * (parameters->position.law.per_speed_q16 >> 4) >> 8,
         .at_torque_limit = fixed_abs(input->torque_reference_q24) >= limit_q24 - limit_q24 / 16,
         .count = state->deferred.slow_counts.slow ? 2 * parameters->encoder_middle : 0,
         .periods = input->periods,

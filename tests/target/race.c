@@ -66,8 +66,8 @@ void configure_tune(control_parameters_t *parameters, const control_parameters_t
     (void)parameters, (void)tuned, (void)part;
 }
 
-void deferred_tune(const control_parameters_t *parameters, control_state_t *state) {
-    (void)parameters, (void)state;
+void deferred_tune(const control_parameters_t *parameters, control_state_t *state, unsigned part) {
+    (void)parameters, (void)state, (void)part;
 }
 
 void control_reset(const control_parameters_t *parameters, control_state_t *state) {

@@ -159,7 +159,9 @@ TEST(Fuzz, no_switch_is_closed_outside_run_and_nothing_is_undefined) {
                 for (unsigned part = 0; part < CONFIGURE_TUNE_PARTS; ++part) {
                     configure_tune(&parameters, &of_the_set, part);
                 }
-                deferred_tune(&parameters, &state);
+                for (unsigned part = 0; part < DEFERRED_TUNE_PARTS; ++part) {
+                    deferred_tune(&parameters, &state, part);
+                }
                 ASSERT_STREQ(difference(parameters, of_the_set), "") << "sequence " << sequence;
             }
             state.position_command = position_command(&parameters.position, &bench.command.position, 1 << 14, 1 << 14);

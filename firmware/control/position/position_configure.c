@@ -61,13 +61,13 @@ COLD static profile_limits_t limits_from(const position_settings_t *settings) {
     return profile_limits(smaller(either(speed, speed_max), speed_max), up, down, jerk);
 }
 
-COLD static void set_scales(const position_settings_t *settings, position_parameters_t *position) {
+COLD static void set_scales(const position_settings_t *settings, position_law_t *law) {
     const int64_t per_q16 = per_speed_q16(settings);
     const int64_t rate_per_tick = settings->control_rate_hz / PROFILE_TICK_HZ;
     /* To speed: 2^16 / per_q16. To torque: the speed that an acceleration adds in a period, by an LSB's. */
-    position->speed_of = profile_scale_of(INT64_C(1) << 16, per_q16);
-    position->gain = profile_scale_of((int64_t)fixed_max(settings->gain_1_s, 1) << 16, per_q16 * PROFILE_TICK_HZ);
-    position->torque_of =
+    law->speed_of = profile_scale_of(INT64_C(1) << 16, per_q16);
+    law->gain = profile_scale_of((int64_t)fixed_max(settings->gain_1_s, 1) << 16, per_q16 * PROFILE_TICK_HZ);
+    law->torque_of =
         profile_scale_of(INT64_C(1) << 32, (per_q16 >> 8) * ((int64_t)settings->acceleration_q32 * rate_per_tick >> 8));
 }
 
@@ -85,30 +85,37 @@ COLD position_parameters_t position_configure(const position_settings_t *setting
     const int64_t edge = POSITION_MAX << (PROFILE_FRACTION_BITS - 32);
     const uint32_t periods = settings->control_rate_hz / PROFILE_TICK_HZ;
     position_parameters_t position = {
-        .periods_per_tick = periods,
-        .speed_exponent = settings->speed_exponent,
-        .per_speed_q16 = per_speed_q16(settings),
-        .part_per_period_q32 = UINT32_MAX / periods,
-        .lowest = fixed_clamp_64(settings->lowest_rev * REV, -edge, edge),
-        .highest = fixed_clamp_64(settings->highest_rev * REV, -edge, edge),
-        .window = fixed_divide(settings->window_q15 * (REV >> 15), 360),
-        .following_error = fixed_divide(settings->following_error_q7 * (REV >> 7), 360),
-        .homing_speed = in_unit(settings->homing_speed_rpm, settings->speed_exponent, PER_RPM_Q8) >> 8,
-        .homing_torque_q24 =
-            settings->homing_torque_q24 > 0 ? settings->homing_torque_q24 : settings->torque_max_q24 / 4,
-        .acceleration_max = acceleration_by_torque(settings) / 4 * 3,
-        .cycle = cycle_of(settings->cycle_ms),
-        .limits = limits_from(settings),
+        .law =
+            {
+                .periods_per_tick = periods,
+                .part_per_period_q32 = UINT32_MAX / periods,
+                .per_speed_q16 = per_speed_q16(settings),
+                .window = fixed_divide(settings->window_q15 * (REV >> 15), 360),
+                .following_error = fixed_divide(settings->following_error_q7 * (REV >> 7), 360),
+                .homing_speed = in_unit(settings->homing_speed_rpm, settings->speed_exponent, PER_RPM_Q8) >> 8,
+                .homing_torque_q24 =
+                    settings->homing_torque_q24 > 0 ? settings->homing_torque_q24 : settings->torque_max_q24 / 4,
+            },
+        .plan =
+            {
+                .speed_exponent = settings->speed_exponent,
+                .lowest = fixed_clamp_64(settings->lowest_rev * REV, -edge, edge),
+                .highest = fixed_clamp_64(settings->highest_rev * REV, -edge, edge),
+                .acceleration_max = acceleration_by_torque(settings) / 4 * 3,
+                .cycle = cycle_of(settings->cycle_ms),
+                .limits = limits_from(settings),
+            },
     };
-    position.highest = position.highest > position.lowest ? position.highest : position.lowest;
-    set_scales(settings, &position);
+    position_plan_t *plan = &position.plan;
+    plan->highest = plan->highest > plan->lowest ? plan->highest : plan->lowest;
+    set_scales(settings, &position.law);
     return position;
 }
 
 /* 2^-48 rev from 2^-32 rev, within the end stops of the parameters. */
 COLD static int64_t within(const position_parameters_t *parameters, int64_t position) {
     const int64_t limited = fixed_clamp_64(position, -POSITION_MAX, POSITION_MAX);
-    return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->lowest, parameters->highest);
+    return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->plan.lowest, parameters->plan.highest);
 }
 
 /* Acceleration by 3/4 of the largest torque, of an inertia that exceeds the parameter by more than an eighth; by what
@@ -119,8 +126,8 @@ COLD static int64_t acceleration_left(const position_parameters_t *parameters, i
     if (ratio_q14 <= RATIO_LARGE_Q14 && left_q14 == USED_Q14) {
         return INT64_MAX;
     }
-    const int64_t unit = fixed_divide(parameters->acceleration_max, USED_Q14);
-    const int64_t most = parameters->acceleration_max - unit * (USED_Q14 - left_q14);
+    const int64_t unit = fixed_divide(parameters->plan.acceleration_max, USED_Q14);
+    const int64_t most = parameters->plan.acceleration_max - unit * (USED_Q14 - left_q14);
     return fixed_divide(most, fixed_max(ratio_q14, RATIO_MIN_Q14)) << 14;
 }
 
@@ -128,10 +135,10 @@ COLD position_command_t position_command(const position_parameters_t *parameters
                                          int32_t inertia_ratio_q14, int32_t torque_left_q14) {
     position_command_t command = {
         .set_point = *set_point,
-        .limits = parameters->limits,
-        .cycle = set_point->cycle_ms > 0 ? cycle_of(set_point->cycle_ms) : parameters->cycle,
-        .lowest = parameters->lowest,
-        .highest = parameters->highest,
+        .limits = parameters->plan.limits,
+        .cycle = set_point->cycle_ms > 0 ? cycle_of(set_point->cycle_ms) : parameters->plan.cycle,
+        .lowest = parameters->plan.lowest,
+        .highest = parameters->plan.highest,
         .inertia_ratio_q14 = fixed_clamp(inertia_ratio_q14, 0, RATIO_MAX_Q14),
     };
     if (set_point->bounded) {
@@ -141,9 +148,9 @@ COLD position_command_t position_command(const position_parameters_t *parameters
     const int64_t most_acceleration = acceleration_left(parameters, command.inertia_ratio_q14, torque_left_q14);
     if (most_acceleration < INT64_MAX || set_point->speed_q22 > 0 || set_point->acceleration_rpm_s > 0 ||
         set_point->deceleration_rpm_s > 0 || set_point->jerk_rpm_s2 > 0) {
-        const profile_limits_t *most = &parameters->limits;
-        const unsigned exponent = parameters->speed_exponent;
-        const int64_t speed = saturated(fixed_max(set_point->speed_q22, 0) >> 4, parameters->per_speed_q16) >> 12;
+        const profile_limits_t *most = &parameters->plan.limits;
+        const unsigned exponent = parameters->plan.speed_exponent;
+        const int64_t speed = saturated(fixed_max(set_point->speed_q22, 0) >> 4, parameters->law.per_speed_q16) >> 12;
         const int64_t up = in_unit(set_point->acceleration_rpm_s, exponent, PER_RPM_S);
         const int64_t down = in_unit(set_point->deceleration_rpm_s, exponent, PER_RPM_S);
         const int64_t jerk = in_unit(set_point->jerk_rpm_s2, exponent, PER_RPM_S2);

@@ -252,7 +252,7 @@ static int64_t error_of_count(const position_t *position, const position_sample_
 }
 
 /* Beyond the limit at the end of a tick. */
-COLD NOINLINE static void check_following(const position_parameters_t *parameters, position_t *position,
+COLD NOINLINE static void check_following(const position_law_t *parameters, position_t *position,
                                           const position_sample_t *sample) {
     position_status_t *status = &position->status;
     const int64_t error = position->profile.start.x - to_profile(status->position);
@@ -312,7 +312,7 @@ COLD NOINLINE static void decide(position_t *position, const position_command_t 
     position->status.homing = position->homing != POSITION_HOMING_IDLE;
 }
 
-COLD NOINLINE static void tick(const position_parameters_t *parameters, position_t *position,
+COLD NOINLINE static void tick(const position_law_t *parameters, position_t *position,
                                const position_command_t *command, const position_sample_t *sample) {
     profile_t *profile = &position->profile;
     if (position->cubic_ticks > 0) {
@@ -333,7 +333,7 @@ COLD NOINLINE static void tick(const position_parameters_t *parameters, position
 }
 
 /* The order's limits with the speed of a homing. */
-static profile_limits_t limits_of(const position_parameters_t *parameters, const position_t *position,
+static profile_limits_t limits_of(const position_law_t *parameters, const position_t *position,
                                   const position_command_t *command) {
     profile_limits_t limits = command->limits;
     if (position->homing != POSITION_HOMING_IDLE && limits.speed > parameters->homing_speed) {
@@ -342,7 +342,7 @@ static profile_limits_t limits_of(const position_parameters_t *parameters, const
     return limits;
 }
 
-static position_output_t output(const position_parameters_t *parameters, position_t *position,
+static position_output_t output(const position_law_t *parameters, position_t *position,
                                 const position_command_t *command, const position_sample_t *sample) {
     position_status_t *status = &position->status;
     const uint32_t part_q16 = (uint32_t)((uint64_t)position->phase * parameters->part_per_period_q32 >> 16);
@@ -364,7 +364,7 @@ static position_output_t output(const position_parameters_t *parameters, positio
     };
 }
 
-position_output_t position_step(const position_parameters_t *parameters, position_t *position,
+position_output_t position_step(const position_law_t *parameters, position_t *position,
                                 const position_command_t *command, const position_sample_t *sample) {
     position_status_t *status = &position->status;
     count(position, sample->encoder_angle, sample->angle);

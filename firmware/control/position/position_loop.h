@@ -44,23 +44,33 @@ typedef struct {
     profile_scale_t half_per_ticks3; /* 1 / 2n^3 */
 } position_cycle_t;
 
-/* Positions in 2^-48 rev. */
+/* Read by the interrupts. Positions in 2^-48 rev. */
 typedef struct {
     uint32_t periods_per_tick;
     uint32_t part_per_period_q32; /* of a tick */
-    uint32_t speed_exponent;
-    int64_t per_speed_q16;     /* LSB of Q9.22 in 2^-48 rev per tick, Q16 */
-    profile_scale_t speed_of;  /* speed of a profile to Q9.22 */
-    profile_scale_t gain;      /* K: position to speed, Q9.22 */
-    profile_scale_t torque_of; /* acceleration to torque, N m, Q7.24 */
-    int64_t lowest, highest;   /* software end stops */
+    int64_t per_speed_q16;        /* LSB of Q9.22 in 2^-48 rev per tick, Q16 */
+    profile_scale_t speed_of;     /* speed of a profile to Q9.22 */
+    profile_scale_t gain;         /* K: position to speed, Q9.22 */
+    profile_scale_t torque_of;    /* acceleration to torque, N m, Q7.24 */
     int64_t window;
     int64_t following_error;
-    int64_t homing_speed;     /* 2^-48 rev per tick */
-    int64_t acceleration_max; /* of the inertia of the parameter by 3/4 of the largest torque */
+    int64_t homing_speed; /* 2^-48 rev per tick */
     int32_t homing_torque_q24;
-    position_cycle_t cycle;  /* of a set point without its own */
-    profile_limits_t limits; /* likewise */
+} position_law_t;
+
+/* Limits of set points, read by the background alone: it makes a command of a set point (position_command). Positions
+ * in 2^-48 rev. */
+typedef struct {
+    uint32_t speed_exponent;
+    int64_t lowest, highest;  /* software end stops */
+    int64_t acceleration_max; /* of the inertia of the parameter by 3/4 of the largest torque */
+    position_cycle_t cycle;   /* of a set point without its own */
+    profile_limits_t limits;  /* likewise */
+} position_plan_t;
+
+typedef struct {
+    position_law_t law;
+    position_plan_t plan;
 } position_parameters_t;
 
 /* Set point with what follows from it; written by the background with the interrupts masked. */
@@ -117,7 +127,7 @@ typedef struct {
 void position_follow(position_t *position, uint32_t encoder_angle, uint32_t angle);
 
 /* One step of position mode. [deferred interrupt] */
-position_output_t position_step(const position_parameters_t *parameters, position_t *position,
+position_output_t position_step(const position_law_t *parameters, position_t *position,
                                 const position_command_t *command, const position_sample_t *sample);
 
 /* True while a torque above homing_torque_q24 must not act. */

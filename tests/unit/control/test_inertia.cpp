@@ -299,6 +299,7 @@ TEST(Inertia, a_run_begins_with_the_power_of_two_alone) {
     EXPECT_NE(inertia.laws.reaching_gain_q24, coarse.laws.reaching_gain_q24);
     const int32_t gain_q24 = inertia.laws.reaching_gain_q24;
     inertia_tune(&parameters, &MODEL, &inertia);
+    inertia_tune_laws(&inertia);
     EXPECT_EQ(inertia.laws.reaching_gain_q24, gain_q24) << "parameters that are tuned in a run leave the inertia";
     inertia_restart(&parameters, &MODEL, &inertia, 0);
     EXPECT_EQ(inertia.laws.reaching_gain_q24, coarse.laws.reaching_gain_q24);

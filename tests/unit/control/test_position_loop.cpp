@@ -73,7 +73,7 @@ class PositionLoop : public testing::Test {
 
     void step() {
         const position_sample_t now = sample();
-        out = position_step(&parameters, &position, &command, &now);
+        out = position_step(&parameters.law, &position, &command, &now);
         const double rad_s = out.speed_q22 / 4194304.0;
         const double next = std::clamp(rotor_rev + rad_s / (2.0 * PI) / RATE_HZ, lowest_rev, highest_rev);
         speed_rev_s = (next - rotor_rev) * RATE_HZ;
@@ -91,13 +91,13 @@ class PositionLoop : public testing::Test {
 
 TEST_F(PositionLoop, units_are_those_of_the_speed_loop_and_the_inertia) {
     const int64_t speed = int64_t(10.0 * REV_48 * 1e-3); // 10 rev/s
-    EXPECT_NEAR(double(profile_scale(speed, parameters.speed_of)) / 4194304.0, 20.0 * PI, 1e-4);
-    EXPECT_NEAR(double(profile_scale(int64_t(REV_48 / 100.0), parameters.gain)) / 4194304.0, 150.0 * 2.0 * PI / 100.0,
+    EXPECT_NEAR(double(profile_scale(speed, parameters.law.speed_of)) / 4194304.0, 20.0 * PI, 1e-4);
+    EXPECT_NEAR(double(profile_scale(int64_t(REV_48 / 100.0), parameters.law.gain)) / 4194304.0, 150.0 * 2.0 * PI / 100.0,
                 1e-4);
     const int64_t acceleration = int64_t(100.0 * REV_48 * 1e-6); // 100 rev/s^2 on 0.02 kg m^2
-    EXPECT_NEAR(double(profile_scale(acceleration, parameters.torque_of)) / 16777216.0, 200.0 * PI * 0.02, 1e-4);
-    EXPECT_NEAR(double(parameters.limits.speed), 300.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
-    EXPECT_NEAR(double(parameters.limits.acceleration), 100.0 * REV_48 * 1e-6, REV_48 * 1e-9);
+    EXPECT_NEAR(double(profile_scale(acceleration, parameters.law.torque_of)) / 16777216.0, 200.0 * PI * 0.02, 1e-4);
+    EXPECT_NEAR(double(parameters.plan.limits.speed), 300.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
+    EXPECT_NEAR(double(parameters.plan.limits.acceleration), 100.0 * REV_48 * 1e-6, REV_48 * 1e-9);
 }
 
 TEST_F(PositionLoop, limits_of_zero_are_found_from_torque_inertia_and_speed) {
@@ -105,8 +105,8 @@ TEST_F(PositionLoop, limits_of_zero_are_found_from_torque_inertia_and_speed) {
     of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
     const position_parameters_t automatic = position_configure(&of);
     const double expected = 0.75 * 19.0 / 0.02 / (2.0 * PI) * REV_48 * 1e-6;
-    EXPECT_NEAR(double(automatic.limits.acceleration), expected, expected * 1e-3);
-    EXPECT_NEAR(6.0 * double(automatic.limits.q), expected / 5.0, expected * 1e-3);
+    EXPECT_NEAR(double(automatic.plan.limits.acceleration), expected, expected * 1e-3);
+    EXPECT_NEAR(6.0 * double(automatic.plan.limits.q), expected / 5.0, expected * 1e-3);
 }
 
 TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
@@ -114,9 +114,9 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     set_point.speed_q22 = INT32_MAX;
     set_point.acceleration_rpm_s = set_point.deceleration_rpm_s = set_point.jerk_rpm_s2 = INT32_MAX;
     const position_command_t most = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
-    EXPECT_EQ(most.limits.speed, parameters.limits.speed);
-    EXPECT_EQ(most.limits.acceleration, parameters.limits.acceleration);
-    EXPECT_LE(most.limits.q, parameters.limits.q);
+    EXPECT_EQ(most.limits.speed, parameters.plan.limits.speed);
+    EXPECT_EQ(most.limits.acceleration, parameters.plan.limits.acceleration);
+    EXPECT_LE(most.limits.q, parameters.plan.limits.q);
     set_point.speed_q22 = 10 << 22;
     set_point.acceleration_rpm_s = 600;
     set_point.deceleration_rpm_s = INT32_MIN;
@@ -124,7 +124,7 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     const position_command_t less = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
     EXPECT_NEAR(double(less.limits.speed), 10.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);
     EXPECT_NEAR(double(less.limits.acceleration), 10.0 * REV_48 * 1e-6, REV_48 * 1e-9);
-    EXPECT_EQ(less.limits.deceleration, parameters.limits.deceleration);
+    EXPECT_EQ(less.limits.deceleration, parameters.plan.limits.deceleration);
 }
 
 TEST_F(PositionLoop, an_inertia_that_has_become_known_bounds_the_acceleration) {
@@ -132,13 +132,13 @@ TEST_F(PositionLoop, an_inertia_that_has_become_known_bounds_the_acceleration) {
     of.acceleration_rpm_s = of.deceleration_rpm_s = of.jerk_rpm_s2 = 0;
     parameters = position_configure(&of);
     position_set_point_t set_point = {};
-    const double own = double(parameters.limits.acceleration);
+    const double own = double(parameters.plan.limits.acceleration);
     for (const auto &[ratio, part] :
          {std::pair{0.2, 1.0}, {1.0, 1.0}, {1.12, 1.0}, {2.0, 0.5}, {5.0, 0.2}, {60.0, 0.125}}) {
         const position_command_t made = position_command(&parameters, &set_point, int32_t(ratio * (1 << 14)), 1 << 14);
         EXPECT_NEAR(double(made.limits.acceleration), own * part, own * 2e-3) << ratio;
         EXPECT_NEAR(double(made.limits.deceleration), own * part, own * 2e-3) << ratio;
-        EXPECT_EQ(made.limits.speed, parameters.limits.speed);
+        EXPECT_EQ(made.limits.speed, parameters.plan.limits.speed);
     }
     set_point.acceleration_rpm_s = 600; // what is less stays
     const position_command_t slow = position_command(&parameters, &set_point, 2 << 14, 1 << 14);
@@ -150,7 +150,7 @@ TEST_F(PositionLoop, a_load_leaves_less_for_the_acceleration) {
     of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
     parameters = position_configure(&of);
     const position_set_point_t set_point = {};
-    const double own = double(parameters.limits.acceleration);
+    const double own = double(parameters.plan.limits.acceleration);
     for (const auto &[left, ratio, part] : {std::tuple{1.0, 1.0, 1.0},
                                             {0.75, 1.0, 1.0},
                                             {0.5, 1.0, 2.0 / 3.0},
@@ -173,16 +173,16 @@ TEST_F(PositionLoop, a_reference_that_has_left_a_heavier_rotor_behind_goes_on_fr
             for (unsigned i = 0; i < periods; i++) { // it turns by far less
                 position_sample_t now = sample();
                 now.at_torque_limit = at_limit;
-                out = position_step(&parameters, &position, &command, &now);
+                out = position_step(&parameters.law, &position, &command, &now);
             }
         };
-        blocked(12 * parameters.periods_per_tick, true);
+        blocked(12 * parameters.law.periods_per_tick, true);
         const int32_t behind = position.status.error;
         EXPECT_GT(behind, 1 << 20);
         command.inertia_ratio_q14 = 4 << 14;
-        blocked(parameters.periods_per_tick, limited);
+        blocked(parameters.law.periods_per_tick, limited);
         EXPECT_EQ(std::abs(position.status.error) < 1 << 20, limited) << "a torque below its limit keeps up";
-        blocked(12 * parameters.periods_per_tick, limited);
+        blocked(12 * parameters.law.periods_per_tick, limited);
         EXPECT_GT(position.status.error, 1 << 20) << "once";
     }
 }
@@ -280,7 +280,7 @@ TEST_F(PositionLoop, a_rotor_within_the_count_of_its_target_is_in_position) {
         now.encoder_angle = now.angle & ~((1u << 26) - 1u); // 6 bits
         now.count = count;
         for (int i = 0; i < PERIODS; i++) {
-            position_step(&parameters, &position, &command, &now);
+            position_step(&parameters.law, &position, &command, &now);
         }
         return position.status.in_position;
     };
@@ -391,8 +391,8 @@ TEST_F(PositionLoop, a_jump_of_a_cyclic_target_is_approached_within_the_limits) 
         }
     }
     EXPECT_NEAR(rotor_rev, 3.0, 1e-6);
-    EXPECT_LE(acceleration, parameters.limits.acceleration + parameters.limits.acceleration / 1000);
-    EXPECT_LE(speed, parameters.limits.speed);
+    EXPECT_LE(acceleration, parameters.plan.limits.acceleration + parameters.plan.limits.acceleration / 1000);
+    EXPECT_LE(speed, parameters.plan.limits.speed);
 }
 
 TEST_F(PositionLoop, a_sender_of_cyclic_targets_that_ceases_is_a_stop_by_the_profile) {

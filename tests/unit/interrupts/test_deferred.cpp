@@ -76,6 +76,12 @@ class Deferred : public testing::Test {
         ASSERT_TRUE(period(COMMAND_RUN));
     }
 
+    void tune() {
+        for (unsigned part = 0; part < DEFERRED_TUNE_PARTS; part++) {
+            deferred_tune(&parameters, &state, part);
+        }
+    }
+
     const deferred_results_t &results() const { return *deferred_in_effect(&state); }
     bool pending() const { return deferred_pending(&state.deferred_request, &state.deferred.response); }
     const torque_sharing_window_t &window() const {
@@ -639,12 +645,12 @@ TEST_F(Deferred, the_network_of_the_pid_begins_anew_with_each_run) {
 TEST_F(Deferred, tuned_parameters_are_in_effect_at_once_with_the_identified_inertia) {
     start();
     state.deferred.inertia.shift = -1;
-    deferred_tune(&parameters, &state);
+    tune();
     const int32_t gain_q24 = state.deferred.speed_smc.gain_q24, rate_q8 = state.deferred.inertia.laws.rate_q8;
     EXPECT_NEAR(double(gain_q24) / parameters.inertia.reaching_gain_q24, 2.0, 1e-6);
     parameters.inertia.reaching_gain_q24 /= 2;
     parameters.inertia.rate_q8 /= 4;
-    deferred_tune(&parameters, &state);
+    tune();
     EXPECT_NEAR(double(gain_q24) / state.deferred.speed_smc.gain_q24, 2.0, 1e-6);
     EXPECT_NEAR(double(rate_q8) / state.deferred.inertia.laws.rate_q8, 4.0, 1e-2);
 }
