@@ -148,16 +148,6 @@ def look(bug: Bug) -> str:
         return _first_failure(model)
 
 
-def sources() -> str:
-    """Hash of what findings depend on."""
-    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "--deduplicate", *_DEPENDS_ON], cwd=ROOT,
-                            capture_output=True, text=True, check=True).stdout
-    digest = hashlib.sha256()
-    for path in (ROOT / name for name in sorted(listed.splitlines())):
-        digest.update(path.name.encode() + path.read_bytes() if path.is_file() else b"")
-    return digest.hexdigest()
-
-
 def _key(bug: Bug, depended: str) -> str:
     return hashlib.sha256("\0".join((depended, bug.file, bug.old, bug.new)).encode()).hexdigest()[:16]
 
@@ -167,7 +157,7 @@ def run(chosen: Sequence[Bug], out: Path, jobs: int | None = None) -> int:
     for bug in chosen:
         bug.text()
     build_model()
-    depended = sources()
+    depended = tasks.sources_digest(*_DEPENDS_ON)
     looks = [tasks.Task(_key(bug, depended), bug) for bug in chosen]
     found: dict[str, str] = {}
     with Progress(steps_of(len(looks), sys.stderr), sys.stderr, len(looks)) as progress:

@@ -25,6 +25,10 @@ from salient.paths import BUILD, ROOT, build_lock, from_root
 
 _RECORD_STEP_NS = 10_000
 
+SOURCES = ("emulator", "firmware", "hal", "tools/machines", "tools/src/salient/board",
+           "tools/src/salient/experiments/board_same_bits.py")
+"""Sources of the image, of its model, of the host's program and of the comparison, on which a result depends."""
+
 _LEFT_OUT = ("interrupt_time_us", "interrupt_late", "interrupt_storm", "interrupt_lost")
 """Events of a world that the image meets otherwise: its instructions take no time on the bench, and its main program
 sleeps until an interrupt comes."""

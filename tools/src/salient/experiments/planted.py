@@ -318,12 +318,7 @@ def _look(arguments: tuple[Bug, str, Path, int]) -> Finding:
 
 def sources(kind: str) -> str:
     """Hash of what findings of a kind depend on."""
-    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "--deduplicate", *_DEPENDS_ON[kind]],
-                            cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    digest = hashlib.sha256()
-    for path in (ROOT / name for name in sorted(listed.splitlines())):
-        digest.update(path.name.encode() + path.read_bytes() if path.is_file() else b"")
-    return digest.hexdigest()
+    return tasks.sources_digest(*_DEPENDS_ON[kind])
 
 
 def _key(bug: Bug, kind: str, sources: str, seeds_max: int) -> str:

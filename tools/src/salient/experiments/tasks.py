@@ -16,6 +16,7 @@ import hashlib
 import json
 import os
 import socket
+import subprocess
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -27,6 +28,7 @@ from typing import Any, TextIO
 from urllib.parse import urlsplit
 
 from salient.errors import RunFailed, UsageError, cannot_write
+from salient.paths import ROOT
 from salient.workers import process_pool
 
 RESULTS = "runs.jsonl"
@@ -81,6 +83,17 @@ def run(tasks: Sequence[Task], function: Callable[[Any], Any], out: Path, shard:
 def file_digest(file: Path) -> str:
     """SHA-256 of a file, which does not change while this process lasts."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+@lru_cache
+def sources_digest(*names: str) -> str:
+    """SHA-256 of the sources under names: files and folders of the repository, those that git ignores left out."""
+    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "--deduplicate", *names], cwd=ROOT,
+                            capture_output=True, text=True, check=True).stdout
+    digest = hashlib.sha256()
+    for path in (ROOT / name for name in sorted(listed.splitlines())):
+        digest.update(path.name.encode() + path.read_bytes() if path.is_file() else b"")
+    return digest.hexdigest()
 
 
 def check_build(present: str, wanted: str) -> None:

@@ -21,11 +21,12 @@ from typing import Any
 
 from salient.config import BOARD_BUILD
 from salient.errors import exit_code
+from salient.experiments.board_same_bits import SOURCES, board_hashes
 from salient.experiments.campaign.arguments import count
 from salient.experiments.campaign.arguments import parser as parser_of
 from salient.experiments.campaign.failure import replay
 from salient.experiments.campaign.runner import commit, digest, run_world
-from salient.experiments.tasks import Task, run
+from salient.experiments.tasks import Task, run, sources_digest
 
 SUMMARY = "summary.json"
 
@@ -34,8 +35,6 @@ def hashes(task: tuple[int, str]) -> dict[str, Any]:
     """Hashes of a seed, one for each run; task: seed, target. For workers."""
     seed, target = task
     if target == BOARD_BUILD:
-        from salient.experiments.board_same_bits import board_hashes  # builds an image
-
         return board_hashes(seed)
     first = str(run_world(seed).get("hash", "crash"))
     bench, on_target = replay(seed), replay(seed, build=target)
@@ -58,7 +57,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--jobs", type=count, metavar="N", help="processes at once (default as many as cores)")
     options = parser.parse_args(arguments)
     first, seeds, target = options.first, options.seeds, options.target
-    tasks = [Task(f"{target} {seed} {digest()}", (seed, target)) for seed in range(first, first + seeds)]
+    sources = sources_digest(*SOURCES)[:16] if target == BOARD_BUILD else ""
+    tasks = [Task(f"{target} {seed} {digest()} {sources}".strip(), (seed, target)) for seed in range(first, first + seeds)]
     results = [result for _, result in run(tasks, hashes, options.out, jobs=options.jobs)]
     left_out = sorted(result["seed"] for result in results if "left_out" in result)
     different = sorted(result["seed"] for result in results if not equal(result))
