@@ -5,8 +5,9 @@
  *   C dT / dt = P - (T - T_ambient) / R        C, R: thermal_data_t, of the machine file
  *
  * in explicit steps of a millisecond, the first of half one, and at most a control period more, whose energies are
- * exact. A body may be held at a temperature instead. The resistance of a winding in the plant follows its temperature when that has changed by
- * 1 K, which is 0.4 % of the resistance: a run that heats its windings by less has a constant resistance.
+ * exact. A body may be held at a temperature instead. The resistance of a winding in the plant follows its temperature
+ * when that has changed by 1 K, which is 0.4 % of the resistance: a run that heats its windings by less has a constant
+ * resistance.
  *
  * A sensor has the temperature of its body at the end of the step, and the line of hal_adc.h at 12 bits.
  */

@@ -63,8 +63,7 @@ COLD void bus_monitor_check(bus_monitor_t *monitor, const hal_can_frame_t *frame
     bool own = frame->identifier == DRIVE_PARAMETER_RESPONSE_FRAME_ID;
     for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
         const drive_telemetry_message_t *message = &drive_telemetry_messages[i];
-        own = own ||
-              (frame->identifier == message->identifier && machine_tables.phases > message->phases_above);
+        own = own || (frame->identifier == message->identifier && machine_tables.phases > message->phases_above);
     }
     if (!own || frame->extended || frame->remote) {
         return;

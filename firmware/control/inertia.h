@@ -95,8 +95,8 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings);
 void inertia_restart(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia,
                      uint32_t angle);
 
-/* The laws of changed parameters, which do not mean another inertia: those of the parameters, then what follows from
- * them for the identified inertia. An update between the two does no harm. */
+/* The laws of changed parameters, which do not mean another inertia, in two parts: by the parameters, then by the
+ * identified inertia. An update between the two does no harm. */
 void inertia_tune(const inertia_parameters_t *parameters, const load_observer_model_t *model, inertia_t *inertia);
 void inertia_tune_laws(inertia_t *inertia);
 

@@ -75,9 +75,9 @@ static void lines_init(void) {
     SYSCFG_EXTICR3 = PUT(SYSCFG_EXTICR3_EXTI10, EXTI_PORT_C);
     SYSCFG_EXTICR4 = PUT(SYSCFG_EXTICR4_EXTI12, EXTI_PORT_B) | PUT(SYSCFG_EXTICR4_EXTI13, EXTI_PORT_B);
     EXTI_FTSR1 |= LINES;
-    EXTI_IMR1 |= LINES;               /* the latch; no interrupt of the NVIC is enabled for it */
+    EXTI_IMR1 |= LINES;                  /* the latch; no interrupt of the NVIC is enabled for it */
     EXTI_SWIER1 = LINES & ~lines_high(); /* one that fell before the reset is a cause also when it has risen again */
-    SYSCFG_CFGR2 |= SYSCFG_CFGR2_CLL; /* a lock-up of the processor is a break, too */
+    SYSCFG_CFGR2 |= SYSCFG_CFGR2_CLL;    /* a lock-up of the processor is a break, too */
 }
 
 void break_init(void) {

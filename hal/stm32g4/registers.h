@@ -150,10 +150,10 @@
 
 /* --- Extended interrupts and events controller; bit n: line n --- */
 #define EXTI_BASE 0x40010400u
-#define EXTI_IMR1 REGISTER(EXTI_BASE, 0x00)  /* rw 0xFF820000 */
-#define EXTI_FTSR1 REGISTER(EXTI_BASE, 0x0C) /* rw 0x0 */
+#define EXTI_IMR1 REGISTER(EXTI_BASE, 0x00)   /* rw 0xFF820000 */
+#define EXTI_FTSR1 REGISTER(EXTI_BASE, 0x0C)  /* rw 0x0 */
 #define EXTI_SWIER1 REGISTER(EXTI_BASE, 0x10) /* rw 0x0 */
-#define EXTI_PR1 REGISTER(EXTI_BASE, 0x14)   /* rw 0x0 w1c 0x7BFFFF */
+#define EXTI_PR1 REGISTER(EXTI_BASE, 0x14)    /* rw 0x0 w1c 0x7BFFFF */
 
 /* --- Timers: advanced-control TIM1 and TIM8, general-purpose TIM2 to TIM5 --- */
 #define TIM1_BASE 0x40012C00u

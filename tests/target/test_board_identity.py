@@ -14,7 +14,7 @@ from test_same_bits import load_step_150, start_600
 from salient.bench import programs
 from salient.bench.drive import DriveError
 from salient.config import CONTROLLERS
-from salient.experiments.board_same_bits import pair
+from salient.experiments.board_same_bits import board_hashes, pair
 
 CLOCKS = (programs.BOARD_CLOCK_MHZ, pytest.param(170, marks=pytest.mark.in_turns))
 """Clocks of the processor and the PWM timer: whole nanoseconds a tick, and the board's own, a tick of 5.88 ns."""
@@ -110,3 +110,14 @@ def test_image_and_host_meet_faults_and_power_cuts_alike(make_bench, tmp_path, r
     if run is faults:  # the first answers after a restart come a control period apart
         assert made[1][1] == made[0][1], "true state"
     assert len({str(each) for each in made[0][0]}) > 2
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("seed", [
+    1324,  # STO falls, the watchdog resets the drive, STO rises: its cause is named
+    1443,  # a reset ends bus-off
+])
+def test_worlds_of_the_campaign_are_equal_to_the_bit(seed):
+    hashes = board_hashes(seed)
+    assert hashes["on_target"] == hashes["bench"]
+    assert hashes["frames_on_target"] == hashes["frames_bench"] > 1000

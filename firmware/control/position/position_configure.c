@@ -115,7 +115,8 @@ COLD position_parameters_t position_configure(const position_settings_t *setting
 /* 2^-48 rev from 2^-32 rev, within the end stops of the parameters. */
 COLD static int64_t within(const position_parameters_t *parameters, int64_t position) {
     const int64_t limited = fixed_clamp_64(position, -POSITION_MAX, POSITION_MAX);
-    return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->plan.lowest, parameters->plan.highest);
+    return fixed_clamp_64(limited * (1 << (PROFILE_FRACTION_BITS - 32)), parameters->plan.lowest,
+                          parameters->plan.highest);
 }
 
 /* Acceleration by 3/4 of the largest torque, of an inertia that exceeds the parameter by more than an eighth; by what

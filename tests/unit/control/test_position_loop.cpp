@@ -92,8 +92,8 @@ class PositionLoop : public testing::Test {
 TEST_F(PositionLoop, units_are_those_of_the_speed_loop_and_the_inertia) {
     const int64_t speed = int64_t(10.0 * REV_48 * 1e-3); // 10 rev/s
     EXPECT_NEAR(double(profile_scale(speed, parameters.law.speed_of)) / 4194304.0, 20.0 * PI, 1e-4);
-    EXPECT_NEAR(double(profile_scale(int64_t(REV_48 / 100.0), parameters.law.gain)) / 4194304.0, 150.0 * 2.0 * PI / 100.0,
-                1e-4);
+    EXPECT_NEAR(double(profile_scale(int64_t(REV_48 / 100.0), parameters.law.gain)) / 4194304.0,
+                150.0 * 2.0 * PI / 100.0, 1e-4);
     const int64_t acceleration = int64_t(100.0 * REV_48 * 1e-6); // 100 rev/s^2 on 0.02 kg m^2
     EXPECT_NEAR(double(profile_scale(acceleration, parameters.law.torque_of)) / 16777216.0, 200.0 * PI * 0.02, 1e-4);
     EXPECT_NEAR(double(parameters.plan.limits.speed), 300.0 / (2.0 * PI) * REV_48 * 1e-3, REV_48 * 1e-8);

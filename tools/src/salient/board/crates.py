@@ -3,9 +3,9 @@
     python -m salient.board.crates FOLDER
 
 reads the crates `stm32-metapac` 21.0.0 and `stm32g4` 0.16.0 below a folder (of `cargo vendor --versioned-dirs`, or
-the registry's of `cargo fetch`) and writes hal/stm32g4/facts.json: addresses, offsets, fields, reset values and access of the
-registers in the header, interrupt numbers, and the functions of the pins. The crates take 310 MB and are not needed for
-the check itself.
+the registry's of `cargo fetch`) and writes hal/stm32g4/facts.json: addresses, offsets, fields, reset values and access
+of the registers in the header, interrupt numbers, and the functions of the pins. The crates take 310 MB and are not
+needed for the check itself.
 """
 
 from __future__ import annotations

@@ -23,8 +23,10 @@ def files() -> tuple[Path, ...]:
     return (first, *bundled, *sorted(EXAMPLES.glob("*.toml")), *random_files(RANDOM))
 
 
+@lru_cache
 def pool_file() -> Path:
-    """The machines as salient_campaign reads them (emulator/campaign/main.c)."""
+    """The machines as salient_campaign reads them (emulator/campaign/main.c), which do not change while this process
+    lasts."""
     lines = [pool_line(path) for path in files()]
     path = BUILD / "campaign" / "machines.txt"
     keep_text(path, "".join(f"{line}\n" for line in lines))

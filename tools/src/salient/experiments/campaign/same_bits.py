@@ -58,7 +58,8 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     first, seeds, target = options.first, options.seeds, options.target
     sources = sources_digest(*SOURCES)[:16] if target == BOARD_BUILD else ""
-    tasks = [Task(f"{target} {seed} {digest()} {sources}".strip(), (seed, target)) for seed in range(first, first + seeds)]
+    depended = f"{digest()} {sources}".strip()
+    tasks = [Task(f"{target} {seed} {depended}", (seed, target)) for seed in range(first, first + seeds)]
     results = [result for _, result in run(tasks, hashes, options.out, jobs=options.jobs)]
     left_out = sorted(result["seed"] for result in results if "left_out" in result)
     different = sorted(result["seed"] for result in results if not equal(result))
