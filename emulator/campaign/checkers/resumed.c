@@ -16,8 +16,9 @@ static void on_interrupt(const observation_t *seen, void *memory, checker_report
         if (event == NULL || event->kind != WORLD_SET || event->what != BENCH_VARIABLE_TRANSMIT_ERROR_COUNTER) {
             continue;
         }
-        const uint64_t begin_ns = event->begin_us * 1000 + BUS_OFF_NS;
-        if (seen->client.withdrawn_ns < begin_ns && seen->reset_ns < begin_ns && now_ns > begin_ns + BUS_OFF_NS) {
+        const uint64_t off_ns = event->begin_us * 1000, begin_ns = off_ns + BUS_OFF_NS;
+        /* A reset ends bus-off, and the arming with it. */
+        if (seen->client.withdrawn_ns < begin_ns && seen->reset_ns < off_ns && now_ns > begin_ns + BUS_OFF_NS) {
             checker_violated(report, 0, (double)(now_ns - begin_ns) * 1e-6);
         }
     }
