@@ -92,6 +92,7 @@ WASM_DEPENDENCIES = (
 )
 COVERAGE = Dependency("libclang-rt-19-dev", "counters of what the unit tests cover",
                       _file("/usr/lib/llvm-19/lib/clang/19/lib/linux/libclang_rt.profile-x86_64.a"))
+STATIC_ANALYSIS = Dependency("cppcheck", "static analysis by the rules of MISRA C:2012", _tool("cppcheck"))
 BROWSER = Dependency("chromium", "browser in which the live page is tested and measured", _tool("chromium"))
 TEST_DEPENDENCIES = (
     *WASM_DEPENDENCIES,
@@ -99,6 +100,7 @@ TEST_DEPENDENCIES = (
     *(dependency for group in TARGET_DEPENDENCIES.values() for dependency in group),
     BROWSER,
     COVERAGE,
+    STATIC_ANALYSIS,
     Dependency("qemu-system-x86", "VM with a kernel that has CAN", lambda: not _vm_packages()),
 )
 MEASUREMENT_DEPENDENCIES = (

@@ -111,7 +111,7 @@ static arming_result_t confirm(arming_t *arming, arming_attempt_t attempt, bool 
 COLD arming_result_t arming_receive(arming_t *arming, hal_t *hal, const hal_can_frame_t *frame, bool permitted,
                                     uint32_t time_us) {
     struct drive_arm_t message;
-    drive_arm_unpack(&message, frame->data, frame->length);
+    (void)drive_arm_unpack(&message, frame->data, frame->length);
     switch ((arming_step_t)message.step) {
     case ARMING_STEP_REQUEST_RUN:
         return permitted && !arming->armed ? request(arming, hal, ARMING_ATTEMPT_RUN, frame, time_us)
@@ -137,5 +137,5 @@ COLD void arming_report(const arming_t *arming, uint16_t run_unarmed, hal_can_fr
         .run_unarmed = run_unarmed,
     };
     *frame = (hal_can_frame_t){.identifier = DRIVE_ARMING_FRAME_ID, .length = DRIVE_ARMING_LENGTH};
-    drive_arming_pack(frame->data, &message, sizeof frame->data);
+    (void)drive_arming_pack(frame->data, &message, sizeof frame->data);
 }

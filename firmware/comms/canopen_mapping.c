@@ -17,8 +17,8 @@ static const int32_t transmit_mapped[CANOPEN_PDOS] = {0, MAPPED(0x6061, 0, 8), M
 #define INHIBIT_INITIAL 100 /* 10 ms, of those with a measured value */
 
 COLD void canopen_mapping_restart(canopen_t *canopen) {
-    memset(canopen->rpdo, 0, sizeof canopen->rpdo);
-    memset(canopen->tpdo, 0, sizeof canopen->tpdo);
+    (void)memset(canopen->rpdo, 0, sizeof canopen->rpdo);
+    (void)memset(canopen->tpdo, 0, sizeof canopen->tpdo);
 }
 
 COLD void canopen_mapping_reset(canopen_t *canopen) {

@@ -33,7 +33,7 @@ static bool take_value(canopen_t *canopen, const canopen_context_t *context, con
         return canopen_check(canopen, object, value) == CANOPEN_DONE;
     }
     if (pass == STOP ? control && canopen_drive_is_stop(canopen, (uint32_t)value) : control == (pass == CONTROL)) {
-        canopen_write(canopen, context, object, value);
+        (void)canopen_write(canopen, context, object, value);
     }
     return true;
 }
@@ -68,7 +68,7 @@ static void take(canopen_t *canopen, const canopen_context_t *context, unsigned 
     }
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
         if ((pdos >> pdo & 1u) != 0) {
-            pass_over(canopen, context, pdo, (refused >> pdo & 1u) != 0 ? STOP : CONTROL);
+            (void)pass_over(canopen, context, pdo, (refused >> pdo & 1u) != 0 ? STOP : CONTROL);
         }
     }
 }
@@ -93,7 +93,7 @@ static void receive(canopen_t *canopen, const canopen_context_t *context, unsign
     rpdo->seen = true;
     rpdo->time_us = context->time_us;
     rpdo->length = (uint8_t)length;
-    memcpy(rpdo->data, frame->data, length);
+    (void)memcpy(rpdo->data, frame->data, length);
     rpdo->waiting = canopen->values[CANOPEN_VALUE_RPDO_TYPE + pdo] <= CANOPEN_PDO_SYNC_MAX;
     if (!rpdo->waiting) {
         take(canopen, context, 1u << pdo);
@@ -123,7 +123,7 @@ static unsigned present(const canopen_t *canopen, const canopen_context_t *conte
             bytes + canopen_bytes(&object) > 8u) {
             break;
         }
-        canopen_read(canopen, context, &object, &value);
+        (void)canopen_read(canopen, context, &object, &value);
         canopen_pack(data + bytes, canopen_bytes(&object), value);
         bytes += canopen_bytes(&object);
     }
@@ -137,7 +137,7 @@ static void transmit(canopen_t *canopen, const canopen_context_t *context, unsig
     tpdo->event = false;
     tpdo->syncs = 0;
     tpdo->time_us = context->time_us;
-    memcpy(tpdo->data, data, 8);
+    (void)memcpy(tpdo->data, data, 8);
     if (bytes != 0) { /* else the mapping is empty, and there is no PDO */
         canopen_send(canopen, context, canopen_mapping_id(canopen, CANOPEN_VALUE_TPDO_ID, pdo) & CANOPEN_PDO_ID, data,
                      bytes);

@@ -80,7 +80,7 @@ static canopen_move_t set_point(const canopen_t *canopen) {
 }
 
 /* Begins a move at once. */
-static void move(canopen_t *canopen, const canopen_move_t *to) {
+static void begin_move(canopen_t *canopen, const canopen_move_t *to) {
     canopen_position_t *position = &canopen->position;
     position->move = *to;
     position->moving = position->targeted = true;
@@ -100,7 +100,7 @@ static void take_set_point(canopen_t *canopen) {
         position->next = wanted;
         position->waiting = true;
     } else {
-        move(canopen, &wanted);
+        begin_move(canopen, &wanted);
     }
 }
 
@@ -115,7 +115,7 @@ static void step_profile(canopen_t *canopen) {
         position->moving = false;
         if (position->waiting) {
             const canopen_move_t next = position->next;
-            move(canopen, &next);
+            begin_move(canopen, &next);
         }
     }
     position->acknowledged = position->acknowledged && ((controlword(canopen) & ORDER) != 0 || position->waiting);

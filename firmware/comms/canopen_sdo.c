@@ -21,7 +21,7 @@ static void start_download(canopen_t *canopen, const canopen_context_t *context,
         const unsigned given = (request[0] & SIZED) != 0 ? 4u - (request[0] >> 2 & 3u) : bytes;
         abort = given > sdo->size ? CANOPEN_TOO_LONG : given < sdo->size ? CANOPEN_TOO_SHORT : CANOPEN_DONE;
         if (abort == CANOPEN_DONE) {
-            memcpy(sdo->buffer, request + 4, sizeof sdo->buffer);
+            (void)memcpy(sdo->buffer, request + 4, sizeof sdo->buffer);
             sdo->offset = bytes;
             abort = canopen_sdo_commit(canopen, context);
         }

@@ -103,7 +103,7 @@ COLD void canopen_sdo_block_step(canopen_t *canopen, const canopen_context_t *co
         if (at >= sdo->size) { /* the last one is on its way */
             break;
         }
-        canopen_sdo_get(canopen, context, at, segment + 1, CANOPEN_BLOCK_BYTES);
+        (void)canopen_sdo_get(canopen, context, at, segment + 1, CANOPEN_BLOCK_BYTES);
         sdo->sequence++;
         segment[0] = (uint8_t)(sdo->sequence | (at + CANOPEN_BLOCK_BYTES >= sdo->size ? LAST : 0u));
         canopen_sdo_send(canopen, context, segment);
@@ -148,7 +148,7 @@ COLD void canopen_sdo_block_segment(canopen_t *canopen, const canopen_context_t 
         sdo->time_us = context->time_us;
         sdo->sequence++;
         if (last) {
-            memcpy(sdo->last, segment + 1, sizeof sdo->last);
+            (void)memcpy(sdo->last, segment + 1, sizeof sdo->last);
             sdo->state = CANOPEN_SDO_BLOCK_LAST;
         } else if (!append(canopen, context, segment + 1, CANOPEN_BLOCK_BYTES)) {
             canopen_sdo_abort(canopen, context, CANOPEN_TOO_LONG);

@@ -62,7 +62,7 @@ COLD uint32_t canopen_sdo_begin(canopen_t *canopen, const canopen_context_t *con
     }
     int32_t value = 0;
     if (!download && canopen_bytes(object) != 0) {
-        canopen_read(canopen, context, object, &value);
+        (void)canopen_read(canopen, context, object, &value);
         canopen_pack(sdo->buffer, canopen_bytes(object), value);
     }
     return CANOPEN_DONE;

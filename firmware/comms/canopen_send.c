@@ -16,7 +16,7 @@ COLD void canopen_send(canopen_t *canopen, const canopen_context_t *context, uin
         return;
     }
     hal_can_frame_t frame = {.identifier = identifier, .length = (uint8_t)fixed_min_u32(length, sizeof frame.data)};
-    memcpy(frame.data, data, frame.length);
+    (void)memcpy(frame.data, data, frame.length);
     frame_queue_push(context->queue, &frame);
 }
 

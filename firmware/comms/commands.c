@@ -47,7 +47,7 @@ COLD void commands_supervise(commands_t *commands, drive_state_t state, uint32_t
     }
     commands->state = state;
     arming_check_timeout(&commands->arming, time_us);
-    if (commands->arming.armed) {
+    if (commands->arming.armed != 0) {
         commands->ran |= state == DRIVE_STATE_RUN;
         if (must_disarm(commands, time_us, timeout_us)) {
             commands_disarm(commands);
@@ -67,7 +67,7 @@ static commands_frame_t reject(uint16_t *counter) {
 
 /* As reject, of a command frame. [SR-33] */
 static commands_frame_t reject_command(commands_t *commands, uint16_t *counter) {
-    if (commands->arming.armed) {
+    if (commands->arming.armed != 0) {
         commands->errors = (uint16_t)(commands->errors + COMMANDS_ERROR_STEP);
         if (commands->errors > (COMMANDS_ERRORS_MAX - 1u) * COMMANDS_ERROR_STEP) {
             commands->failed = true;
@@ -85,13 +85,13 @@ static_assert(DRIVE_POSITION_COMMAND_LENGTH == (unsigned)DRIVE_IDENTIFY_COMMAND_
 static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *identify, command_t *command) {
     if (frame->identifier == DRIVE_IDENTIFY_WINDOW_FRAME_ID) {
         struct drive_identify_window_t window;
-        drive_identify_window_unpack(&window, frame->data, frame->length);
+        (void)drive_identify_window_unpack(&window, frame->data, frame->length);
         identify->angle_q16 = window.angle;
         identify->width_q16 = window.width;
         return true;
     }
     struct drive_identify_command_t message;
-    drive_identify_command_unpack(&message, frame->data, frame->length);
+    (void)drive_identify_command_unpack(&message, frame->data, frame->length);
     if (!drive_identify_command_request_is_in_range(message.request) ||
         !drive_identify_command_kind_is_in_range(message.kind) || message.phase >= machine_tables.phases) {
         return false;
@@ -110,7 +110,7 @@ static bool unpack_identify(const hal_can_frame_t *frame, identify_command_t *id
 /* As unpack; the order and the position in its range are valid in every bit. [SR-32] */
 static bool unpack_position(const hal_can_frame_t *frame, command_t *command) {
     struct drive_position_command_t message;
-    drive_position_command_unpack(&message, frame->data, frame->length);
+    (void)drive_position_command_unpack(&message, frame->data, frame->length);
     if (!drive_position_command_request_is_in_range(message.request) ||
         !drive_position_command_order_is_in_range(message.order)) {
         return false;
@@ -135,7 +135,7 @@ static bool unpack(const hal_can_frame_t *frame, command_t *command) {
     }
     if (frame->identifier == DRIVE_TORQUE_COMMAND_FRAME_ID) {
         struct drive_torque_command_t message;
-        drive_torque_command_unpack(&message, frame->data, frame->length);
+        (void)drive_torque_command_unpack(&message, frame->data, frame->length);
         if (!drive_torque_command_request_is_in_range(message.request)) {
             return false;
         }
@@ -145,7 +145,7 @@ static bool unpack(const hal_can_frame_t *frame, command_t *command) {
         return true;
     }
     struct drive_command_t message;
-    drive_command_unpack(&message, frame->data, frame->length);
+    (void)drive_command_unpack(&message, frame->data, frame->length);
     if (!drive_command_request_is_in_range(message.request) ||
         fixed_abs(message.speed_reference_rpm) > machine_tables.speed_reference_max) {
         return false;
@@ -162,7 +162,7 @@ static void publish(commands_t *commands, command_t *command) {
     if (!command_needs_arming(command->request)) {
         return;
     }
-    if (commands->arming.armed) {
+    if (commands->arming.armed != 0) {
         commands->used = true;
     } else {
         command->request = COMMAND_OFF;
@@ -292,7 +292,7 @@ static commands_frame_t receive_set(commands_t *commands, unsigned data_id, unsi
         return reject(&counters->wrong_checksum);
     }
     if (!commands->arming.configuring) {
-        arming_refuse(&commands->arming);
+        (void)arming_refuse(&commands->arming);
     } else if (e2e_check(&commands->set_receiver, data_id_of_node, frame->data, frame->length) != E2E_ACCEPTED) {
         return reject(&counters->wrong_counter);
     } else {

@@ -120,7 +120,7 @@ COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parame
         frame_queue_peek(&comms->responses) == NULL &&
         xcp_next_frame(&comms->xcp, parameters, status.transmitting, &frame)) {
         frame.identifier += comms->telemetry.identifier_offset;
-        hal_can_transmit(hal, &frame);
+        (void)hal_can_transmit(hal, &frame);
     }
 }
 

@@ -140,7 +140,7 @@ static parameter_status_t fault_item(const nvm_store_t *store, const hal_t *hal,
 bool memory_protocol_respond(const nvm_store_t *store, const self_test_t *test, const hal_t *hal,
                              const hal_can_frame_t *frame, hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
-    drive_parameter_request_unpack(&request, frame->data, frame->length);
+    (void)drive_parameter_request_unpack(&request, frame->data, frame->length);
     struct drive_parameter_response_t response = {
         .operation = request.operation, .index = request.index, .part = request.part, .value = 0};
     parameter_status_t status = PARAMETER_STATUS_UNPROTECTED;
@@ -161,6 +161,6 @@ bool memory_protocol_respond(const nvm_store_t *store, const self_test_t *test, 
     response.status = (uint8_t)status;
     *response_frame =
         (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
-    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
+    (void)drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
     return true;
 }

@@ -22,7 +22,7 @@ static int32_t text_part(const char *text, unsigned part) {
 void parameter_protocol_respond(const parameters_t *parameters, const hal_can_frame_t *frame,
                                 hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
-    drive_parameter_request_unpack(&request, frame->data, frame->length);
+    (void)drive_parameter_request_unpack(&request, frame->data, frame->length);
     struct drive_parameter_response_t response = {
         .operation = request.operation, .index = request.index, .part = request.part, .status = PARAMETER_STATUS_DONE};
 
@@ -64,5 +64,5 @@ void parameter_protocol_respond(const parameters_t *parameters, const hal_can_fr
     }
     *response_frame =
         (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
-    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
+    (void)drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
 }

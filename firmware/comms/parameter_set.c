@@ -24,7 +24,7 @@ static void stage(parameter_set_t *set, unsigned index, int32_t value) {
 
 void parameter_set_write(parameter_set_t *set, const hal_can_frame_t *frame) {
     struct drive_parameter_write_t message;
-    drive_parameter_write_unpack(&message, frame->data, frame->length);
+    (void)drive_parameter_write_unpack(&message, frame->data, frame->length);
     stage(set, message.index, message.value);
     set->crc = crc32_continue(set->crc, frame->data + E2E_HEADER_BYTES, frame->length - E2E_HEADER_BYTES);
 }
@@ -92,7 +92,7 @@ bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *param
                            const parameters_conditions_t *conditions, const hal_can_frame_t *frame,
                            hal_can_frame_t *response_frame) {
     struct drive_parameter_set_control_t message;
-    drive_parameter_set_control_unpack(&message, frame->data, frame->length);
+    (void)drive_parameter_set_control_unpack(&message, frame->data, frame->length);
     const parameter_set_step_t step = (parameter_set_step_t)message.step;
     parameters_verdict_t verdict = {armed ? PARAMETER_STATUS_DONE : PARAMETER_STATUS_NOT_ARMED, 0, 0};
     const bool begins = step == PARAMETER_SET_STEP_BEGIN || step == PARAMETER_SET_STEP_BEGIN_DEFAULTS;
@@ -116,6 +116,6 @@ bool parameter_set_control(parameter_set_t *set, bool armed, parameters_t *param
     };
     *response_frame =
         (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
-    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
+    (void)drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
     return armed && !begins;
 }

@@ -64,7 +64,7 @@ static uint16_t item(const control_parameters_t *parameters, const fault_trace_p
 bool trace_protocol_respond(const fault_trace_t *trace, const control_parameters_t *parameters,
                             const hal_can_frame_t *frame, hal_can_frame_t *response_frame) {
     struct drive_parameter_request_t request;
-    drive_parameter_request_unpack(&request, frame->data, frame->length);
+    (void)drive_parameter_request_unpack(&request, frame->data, frame->length);
     if (request.operation != PARAMETER_OPERATION_FAULT_TRACE) {
         return false;
     }
@@ -82,6 +82,6 @@ bool trace_protocol_respond(const fault_trace_t *trace, const control_parameters
     }
     *response_frame =
         (hal_can_frame_t){.identifier = DRIVE_PARAMETER_RESPONSE_FRAME_ID, .length = DRIVE_PARAMETER_RESPONSE_LENGTH};
-    drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
+    (void)drive_parameter_response_pack(response_frame->data, &response, sizeof response_frame->data);
     return true;
 }

@@ -74,7 +74,7 @@ static void identify(xcp_t *xcp) {
     }
     at = append_hexadecimal(at, LAYOUT_HASH);
     at = append_hexadecimal(at, machine_tables.dbc_hash);
-    append_hexadecimal(at, xcp->words);
+    (void)append_hexadecimal(at, xcp->words);
 }
 
 void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {

@@ -254,7 +254,7 @@ static conduction_interval_t sharing_interval(const conduction_parameters_t *par
     if (parameters->own_windows) {
         return (conduction_interval_t){.enter = own.on, .leave = own.off};
     }
-    if (state->braking) {
+    if (state->braking != 0) {
         return (conduction_interval_t){.enter = -sharing->turn_off, .leave = -sharing->turn_on};
     }
     /* Windows advance against the rotation, which would be later for a braking phase. */

@@ -148,7 +148,7 @@ COLD void inertia_tune_laws(inertia_t *inertia) {
 }
 
 /* Ends a window. */
-static void measure(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t angle) {
+static void measure_course(const inertia_parameters_t *parameters, inertia_t *inertia, uint32_t angle) {
     const uint32_t rotation = angle - inertia->angle;
     const int32_t change = (int32_t)(rotation - inertia->rotation);
     inertia->torque_q23 = (int32_t)(inertia->sum_of_sums_q23 - inertia->last_sum_of_sums_q23);
@@ -224,7 +224,7 @@ void inertia_step(const inertia_parameters_t *parameters, inertia_t *inertia, ui
     const uint32_t windows = inertia->updates >> parameters->window_shift;
     const uint32_t update = inertia->updates - (windows << parameters->window_shift);
     if (update == 0) {
-        measure(parameters, inertia, angle);
+        measure_course(parameters, inertia, angle);
         correlate(inertia, windows);
     } else if (update == 1 && windows > 1) { /* the rotation before the first window is unknown */
         limit_shift(inertia);

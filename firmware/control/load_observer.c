@@ -15,7 +15,6 @@
 /* 2 pi in Q3.28. It joins angle and speed: its products are divided by the unit of speed, 2^speed_exponent rad/s, or
  * multiplied by it. */
 #define TWO_PI_Q28 1686629713
-#define TWO_PI_Q9 3217
 
 /* 1 - e^-y in Q1.31 for y in Q1.31, 0..0.5, by its series y (1 - y/2 (1 - y/3 (1 - y/4 (1 - y/5)))). At small
  * bandwidths the difference 1 - exp2_negative_q31() would be wrong by half a percent. Products below 2^62. */

@@ -54,7 +54,7 @@ typedef struct {
 } difference_t;
 
 /* Over an eighth of a current. */
-static difference_t difference(const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
+static difference_t difference_at(const machine_tables_t *tables, uint32_t angle, int32_t current_q9) {
     const int32_t high_q9 = fixed_clamp(current_q9 + (current_q9 >> 3), 0, PHASE_MAP_CURRENT_MAX_Q9);
     const uint32_t distance = phase_map_distance(angle);
     return (difference_t){
@@ -65,7 +65,7 @@ static difference_t difference(const machine_tables_t *tables, uint32_t angle, i
 
 void pwm_ditc_set_reference_point(pwm_ditc_parameters_t *parameters, const machine_tables_t *tables, uint32_t angle,
                                   int32_t voltage_step_q29) {
-    const difference_t at = difference(tables, angle, parameters->current_limit_q9 >> 1);
+    const difference_t at = difference_at(tables, angle, parameters->current_limit_q9 >> 1);
     const int64_t torque = at.torque > 0 ? at.torque : 1;                /* without torque there the largest values */
     const int64_t flux_q29 = fixed_clamp(at.flux_q29, 1, (1 << 29) - 1); /* below 1 Wb */
     parameters->torque_per_flux_q16 = fixed_saturate(fixed_divide(torque << 16, flux_q29));
@@ -93,7 +93,7 @@ static int32_t factor_at(const pwm_ditc_parameters_t *parameters, const machine_
     /* A column below the end of the tables, so that there is a difference. */
     const int32_t from_q9 = fixed_clamp(current_q9, parameters->current_limit_q9 >> 5,
                                         PHASE_MAP_CURRENT_MAX_Q9 - (1 << MACHINE_COLUMN_BITS));
-    const difference_t at = difference(tables, angle, from_q9);
+    const difference_t at = difference_at(tables, angle, from_q9);
     /* With the slope of the reference point. */
     const int32_t expected = fixed_saturate(fixed_product(at.flux_q29, parameters->torque_per_flux_q16) >> 16);
     return limited_ratio_q16(fixed_non_negative(expected), at.torque);

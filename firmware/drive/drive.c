@@ -62,7 +62,7 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
         config->control_rate_hz < machine_tables.control_rate_min_hz || config->node > NODE_MAX) {
         return false;
     }
-    memset(drive, 0, sizeof *drive); /* a structure of this size as a value would be a copy on the stack */
+    (void)memset(drive, 0, sizeof *drive); /* a structure of this size as a value would be a copy on the stack */
     drive->processor_time_q24 = (uint32_t)fixed_divide((int64_t)PROCESSOR_TIME_HZ << 24, clock_hz);
     self_test_init(&drive->self_test, hal, hal_time_us(hal));
     temperature_init(&drive->temperature, hal_time_us(hal));

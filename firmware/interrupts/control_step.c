@@ -26,7 +26,7 @@ void control_prepare(const control_parameters_t *parameters, control_state_t *st
 }
 
 /* The first sample initialises what compares successive samples; all else is as after control_reset. */
-static void start(control_state_t *state) {
+static void first_sample(control_state_t *state) {
     state->started = true;
     load_observer_reset(&state->observer, state->measurement.angle);
     protection_reset(&state->protection, state->measurement.encoder_angle);
@@ -52,7 +52,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     const deferred_results_t *deferred = deferred_in_effect(state);
     measure(parameters, state, deferred, sample);
     if (!state->started) {
-        start(state);
+        first_sample(state);
     }
     const uint64_t fault_mask = protect(parameters, state, sample) | deferred->fault_mask;
     measure_torque(parameters, state, deferred->predictive.misalignment, fault_mask != 0);

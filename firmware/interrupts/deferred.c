@@ -329,8 +329,8 @@ static void step_torque_offset(const control_parameters_t *parameters, deferred_
 NOINLINE static void await_slow_counts(const control_parameters_t *parameters, deferred_t *deferred,
                                        const deferred_input_t *input, uint32_t periods) {
     if (!deferred->slow_counts.slow) {
-        slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
-                         fixed_magnitude(rotation(parameters, input)), periods);
+        (void)slow_counts_step(&parameters->slow_counts, &deferred->slow_counts, input->encoder_angle,
+                               fixed_magnitude(rotation(parameters, input)), periods);
     }
 }
 

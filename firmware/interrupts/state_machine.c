@@ -31,7 +31,7 @@ static bool latch_fault(state_machine_t *state_machine, uint64_t fault_mask) {
 
 /* [SR-48] [SR-51] */
 COLD void state_machine_start_in_fault(state_machine_t *state_machine, uint64_t fault_mask) {
-    latch_fault(state_machine, fault_mask);
+    (void)latch_fault(state_machine, fault_mask);
 }
 
 /* The record by members, because a call of memset takes 44 instructions. [SR-41] */

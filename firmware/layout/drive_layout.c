@@ -3,8 +3,10 @@
 #include "drive/drive.h"
 #include "layout_hash.h"
 
+#include <stddef.h>
+
 extern const drive_t *const drive_layout;
-const drive_t *const drive_layout = 0;
+const drive_t *const drive_layout = NULL;
 
 extern const uint32_t drive_layout_hash;
 const uint32_t drive_layout_hash = LAYOUT_HASH;

@@ -61,7 +61,7 @@ COLD void temperature_step(const temperature_parameters_t *parameters, temperatu
         return;
     }
     temperature->step_us = time_us;
-    memset(temperature->failed_sensors, 0, sizeof temperature->failed_sensors);
+    (void)memset(temperature->failed_sensors, 0, sizeof temperature->failed_sensors);
     int32_t least_room = DERATE_CODES;
     for (temperature_part_t part = 0; part < TEMPERATURE_PARTS; part++) {
         const int32_t hottest = read_part(temperature, hal, part, phases);

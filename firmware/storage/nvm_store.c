@@ -45,7 +45,7 @@ static bool load(const nvm_store_t *store, const hal_t *hal, parameters_t *param
         return false;
     }
     int32_t values[PARAMETER_COUNT];
-    memcpy(values, &payload[1], sizeof values);
+    (void)memcpy(values, &payload[1], sizeof values);
     return parameters_restore(parameters, values);
 }
 
@@ -101,13 +101,13 @@ COLD void nvm_store_follow_fault(nvm_store_t *store, const fault_record_t *recor
         .phases = record->phases,
         .sensors = record->sensors,
     };
-    memcpy(entry->current_q9, record->current_q9, sizeof entry->current_q9);
+    (void)memcpy(entry->current_q9, record->current_q9, sizeof entry->current_q9);
 }
 
 /* [SR-60] */
 static void write_fault(nvm_store_t *store, hal_t *hal) {
     uint64_t payload[FAULT_WORDS];
-    memcpy(payload, &store->waiting[0], sizeof payload);
+    (void)memcpy(payload, &store->waiting[0], sizeof payload);
     const unsigned index = nvm_ring_payload_index(&store->faults);
     if (nvm_ring_step(&store->faults, hal, index < FAULT_WORDS ? payload[index] : 0) != NVM_RING_BUSY) {
         store->waiting_count--;
@@ -166,6 +166,6 @@ COLD bool nvm_store_read_fault(const nvm_store_t *store, const hal_t *hal, uint3
         !nvm_ring_read(&store->faults, hal, sequence, payload)) {
         return false;
     }
-    memcpy(fault, payload, sizeof *fault);
+    (void)memcpy(fault, payload, sizeof *fault);
     return true;
 }

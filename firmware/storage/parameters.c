@@ -222,7 +222,7 @@ parameters_verdict_t parameters_check(const parameters_t *present, const int32_t
 
 /* [SR-56] */
 void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
-    memcpy(parameters->values, values, sizeof parameters->values);
+    (void)memcpy(parameters->values, values, sizeof parameters->values);
     parameters->sum = sum_of(parameters);
     parameters->revision++;
 }

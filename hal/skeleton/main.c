@@ -29,7 +29,7 @@ static void board_interrupts_enable(void) {}
 
 /* Far enough below the present frame for the frames of the calls here; the self-test looks for the pattern. */
 __attribute__((noipa)) static void stack_paint(void) {
-    volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
+    const volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
     for (volatile uint32_t *word = stack_end; word < end; word++) {
         *word = HAL_STACK_UNUSED;
     }
@@ -38,8 +38,8 @@ __attribute__((noipa)) static void stack_paint(void) {
 /* After a reset, with the stack set up. FILL IN: the vector table, or the first instructions, in the section .first. */
 void program_start(void) {
     stack_paint();
-    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
-    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    (void)memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    (void)memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
     board_init();
     const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
     const bool started = drive_init(&drive, &board, &config);

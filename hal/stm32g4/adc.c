@@ -48,7 +48,7 @@ static void start_up(uint32_t adc) {
     ADC_CR(adc) = ADC_CR_ADVREGEN;
     board_wait_us(REGULATOR_START_US, BOARD_CLOCK_MHZ);
     ADC_CR(adc) = ADC_CR_ADVREGEN | ADC_CR_ADCAL;
-    while (ADC_CR(adc) & ADC_CR_ADCAL) {
+    while ((ADC_CR(adc) & ADC_CR_ADCAL) != 0) {
     }
     board_wait_us(CALIBRATION_TO_ENABLE_US, BOARD_CLOCK_MHZ);
     ADC_ISR(adc) = ADC_ISR_ADRDY;
@@ -63,7 +63,7 @@ static void start_temperature(const hal_t *hal) {
 }
 
 void adc_convert_temperature(hal_t *hal) {
-    if (ADC_ISR(ADC2_BASE) & ADC_ISR_EOC) {
+    if ((ADC_ISR(ADC2_BASE) & ADC_ISR_EOC) != 0) {
         hal->temperature_counts[hal->temperature_sensor] = (uint16_t)ADC_DR(ADC2_BASE); /* clears EOC */
         hal->temperature_sensor = (uint8_t)((hal->temperature_sensor + 1u) % BOARD_TEMPERATURES);
         start_temperature(hal);

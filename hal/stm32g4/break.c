@@ -34,18 +34,27 @@
 
 static const uint32_t break_word = TIM_EGR_BG;
 
+static void comparators_write(uint32_t word) {
+    COMP_C7CSR = word;
+    COMP_C4CSR = word;
+    COMP_C3CSR = word;
+    COMP_C2CSR = word;
+}
+
 static void comparators_init(void) {
     const uint32_t mode = PUT(DAC_MCR_MODE1, DAC_INTERNAL) | PUT(DAC_MCR_MODE2, DAC_INTERNAL) |
                           PUT(DAC_MCR_HFSEL, BOARD_CLOCK_MHZ > 160 ? DAC_HFSEL_160_MHZ : DAC_HFSEL_80_MHZ);
     DAC_MCR(DAC3_BASE) = mode;
     DAC_MCR(DAC4_BASE) = mode;
-    DAC_DHR12R1(DAC3_BASE) = DAC_DHR12R2(DAC3_BASE) = DAC_DHR12R1(DAC4_BASE) = board_trip_counts;
+    DAC_DHR12R1(DAC4_BASE) = board_trip_counts;
+    DAC_DHR12R2(DAC3_BASE) = board_trip_counts;
+    DAC_DHR12R1(DAC3_BASE) = board_trip_counts;
     DAC_CR(DAC3_BASE) = DAC_CR_EN1 | DAC_CR_EN2;
     DAC_CR(DAC4_BASE) = DAC_CR_EN1;
     board_wait_us(10, BOARD_CLOCK_MHZ); /* a DAC settles in 8 us at most, a comparator in 5 us */
-    COMP_C2CSR = COMP_C3CSR = COMP_C4CSR = COMP_C7CSR = COMP_CSR;
+    comparators_write(COMP_CSR);
     board_wait_us(10, BOARD_CLOCK_MHZ);
-    COMP_C2CSR = COMP_C3CSR = COMP_C4CSR = COMP_C7CSR = COMP_CSR | COMP_C2CSR_LOCK;
+    comparators_write(COMP_CSR | COMP_C2CSR_LOCK);
 }
 
 /* One channel per timer: a request of the multiplexer may not serve two channels. */
@@ -54,15 +63,18 @@ static void unrenewed_init(void) {
                           PUT(DMA_CCR1_PL, PRIORITY_VERY_HIGH);
     DMAMUX_C0CR = PUT(DMAMUX_C0CR_DMAREQ_ID, REQUEST_TIM3_CH1);
     DMAMUX_C1CR = PUT(DMAMUX_C0CR_DMAREQ_ID, REQUEST_TIM3_CH2);
-    DMA_CNDTR1 = DMA_CNDTR2 = 1;
+    DMA_CNDTR2 = 1;
+    DMA_CNDTR1 = 1;
     DMA_CPAR1 = (uint32_t)(uintptr_t)&TIM_EGR(TIM1_BASE);
     DMA_CPAR2 = (uint32_t)(uintptr_t)&TIM_EGR(TIM8_BASE);
-    DMA_CMAR1 = DMA_CMAR2 = (uint32_t)(uintptr_t)&break_word;
+    DMA_CMAR2 = (uint32_t)(uintptr_t)&break_word;
+    DMA_CMAR1 = (uint32_t)(uintptr_t)&break_word;
     DMA_CCR1 = mode | DMA_CCR1_EN;
     DMA_CCR2 = mode | DMA_CCR1_EN;
     TIM_SMCR(TIM3_BASE) = PUT(TIM_SMCR_TS, TS_ITR0); /* while no mode uses it */
     TIM_SMCR(TIM3_BASE) = PUT(TIM_SMCR_TS, TS_ITR0) | PUT(TIM_SMCR_SMS, SMS_EXTERNAL_CLOCK);
-    TIM_CCR1(TIM3_BASE) = TIM_CCR2(TIM3_BASE) = PERIODS_UNRENEWED;
+    TIM_CCR2(TIM3_BASE) = PERIODS_UNRENEWED;
+    TIM_CCR1(TIM3_BASE) = PERIODS_UNRENEWED;
     TIM_SR(TIM3_BASE) = 0;
     TIM_DIER(TIM3_BASE) = TIM_DIER_CC1DE | TIM_DIER_CC2DE;
 }
@@ -84,8 +96,10 @@ void break_init(void) {
     comparators_init();
     lines_init();
     unrenewed_init();
-    TIM_AF1(TIM1_BASE) = TIM_AF1(TIM8_BASE) = TIM_AF1_BKINE;
-    TIM_AF2(TIM1_BASE) = TIM_AF2(TIM8_BASE) = COMPARATORS_BREAK;
+    TIM_AF1(TIM8_BASE) = TIM_AF1_BKINE;
+    TIM_AF1(TIM1_BASE) = TIM_AF1_BKINE;
+    TIM_AF2(TIM8_BASE) = COMPARATORS_BREAK;
+    TIM_AF2(TIM1_BASE) = COMPARATORS_BREAK;
 }
 
 void break_renew(void) {
@@ -103,7 +117,7 @@ uint32_t break_causes(void) {
     if ((fallen & LINE_STO_2) || !(high & LINE_STO_2)) {
         causes |= HAL_PWM_BREAK_STO_2;
     }
-    if (TIM_SR(TIM3_BASE) & TIM_SR_CC1IF) {
+    if ((TIM_SR(TIM3_BASE) & TIM_SR_CC1IF) != 0) {
         causes |= HAL_PWM_BREAK_NOT_RENEWED;
     }
     if ((flags & TIM_SR_B2IF) || (fallen & LINE_FAULT)) {

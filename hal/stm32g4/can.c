@@ -37,7 +37,7 @@ void can_init(void) {
     FDCAN_IE = FDCAN_IE_RF0NE | FDCAN_IE_RF0LE;
     FDCAN_ILE = FDCAN_ILE_EINT0;
     FDCAN_CCCR = 0;
-    while (FDCAN_CCCR & FDCAN_CCCR_INIT) {
+    while ((FDCAN_CCCR & FDCAN_CCCR_INIT) != 0) {
     }
 }
 
@@ -47,17 +47,17 @@ static void take(hal_can_frame_t *frame, const volatile uint32_t *element) {
     *frame = (hal_can_frame_t){
         .extended = (word0 & WORD0_EXTENDED) != 0,
         .remote = (word0 & WORD0_REMOTE) != 0,
-        .identifier = word0 & WORD0_EXTENDED ? GET(WORD0_EXTENDED_ID, word0) : GET(WORD0_STANDARD_ID, word0),
+        .identifier = (word0 & WORD0_EXTENDED) != 0 ? GET(WORD0_EXTENDED_ID, word0) : GET(WORD0_STANDARD_ID, word0),
         .length = (uint8_t)GET(WORD1_LENGTH, element[1]),
     };
-    memcpy(frame->data, data, sizeof data);
+    (void)memcpy(frame->data, data, sizeof data);
 }
 
 /* The flags first: a frame that arrives after the last look at the FIFO sets them again. */
 void can_interrupt(hal_t *hal) {
     const uint32_t flags = FDCAN_IR & (FDCAN_IR_RF0N | FDCAN_IR_RF0L);
     FDCAN_IR = flags;
-    if (flags & FDCAN_IR_RF0L) {
+    if ((flags & FDCAN_IR_RF0L) != 0) {
         hal->receive_overflows++;
     }
     for (;;) {
@@ -103,7 +103,7 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     const uint32_t index = GET(FDCAN_TXFQS_TFQPI, status);
     volatile uint32_t *element = ELEMENT(TRANSMIT_BUFFERS, index);
     uint32_t data[2];
-    memcpy(data, frame->data, sizeof data);
+    (void)memcpy(data, frame->data, sizeof data);
     element[0] = (frame->extended ? WORD0_EXTENDED | PUT(WORD0_EXTENDED_ID, frame->identifier)
                                   : PUT(WORD0_STANDARD_ID, frame->identifier)) |
                  (frame->remote ? WORD0_REMOTE : 0u);
@@ -119,11 +119,12 @@ void hal_can_status(const hal_t *hal, hal_can_status_t *status) {
     const uint32_t state = FDCAN_PSR, errors = FDCAN_ECR;
     const bool off = (state & FDCAN_PSR_BO) != 0;
     *status = (hal_can_status_t){
-        .state = off                    ? HAL_CAN_BUS_OFF
-                 : state & FDCAN_PSR_EP ? HAL_CAN_ERROR_PASSIVE
-                                        : HAL_CAN_ERROR_ACTIVE,
+        .state = off                           ? HAL_CAN_BUS_OFF
+                 : (state & FDCAN_PSR_EP) != 0 ? HAL_CAN_ERROR_PASSIVE
+                                               : HAL_CAN_ERROR_ACTIVE,
         .transmit_errors = (uint16_t)(off ? HAL_CAN_TRANSMIT_ERRORS_BUS_OFF : GET(FDCAN_ECR_TEC, errors)),
-        .receive_errors = (uint16_t)(errors & FDCAN_ECR_RP ? RECEIVE_ERRORS_PASSIVE : GET(FDCAN_ECR_REC, errors)),
+        .receive_errors =
+            (uint16_t)((errors & FDCAN_ECR_RP) != 0 ? RECEIVE_ERRORS_PASSIVE : GET(FDCAN_ECR_REC, errors)),
         .transmitting = !off && FDCAN_TXBRP != 0,
     };
 }

@@ -4,12 +4,10 @@
 
 #include <stdint.h>
 
-#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04)
+#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04u)
 #define SCB_ICSR_PENDSVSET (UINT32_C(1) << 28)
-#define SCB_VTOR (*(volatile uint32_t *)0xE000ED08)
-#define SCB_AIRCR (*(volatile uint32_t *)0xE000ED0C)
-#define SCB_AIRCR_SYSRESETREQ UINT32_C(0x05FA0004) /* with the key of the register */
-#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22)
+#define SCB_VTOR (*(volatile uint32_t *)0xE000ED08u)
+#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22u)
 #define NVIC_ISER(irq) (*(volatile uint32_t *)(0xE000E100u + 4u * ((irq) / 32u)))
 #define NVIC_ICPR(irq) (*(volatile uint32_t *)(0xE000E280u + 4u * ((irq) / 32u)))
 #define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400u + (irq)))

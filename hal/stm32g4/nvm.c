@@ -40,7 +40,7 @@ static bool begin(void) {
     if (!(FLASH_OPTR & FLASH_OPTR_DBANK) || (FLASH_SR & FLASH_SR_BSY)) {
         return false;
     }
-    if (FLASH_CR & FLASH_CR_LOCK) {
+    if ((FLASH_CR & FLASH_CR_LOCK) != 0) {
         FLASH_KEYR = KEY_1;
         FLASH_KEYR = KEY_2;
     }

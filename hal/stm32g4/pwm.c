@@ -116,8 +116,10 @@ void hal_pwm_open_all(hal_t *hal) {
         const uint32_t tim = timers[i];
         TIM_CCMR1(tim) = CCMR1_MODES;
         TIM_CCMR2(tim) = CCMR2_MODES;
-        TIM_CCR1(tim) = TIM_CCR3(tim) = 0;
-        TIM_CCR2(tim) = TIM_CCR4(tim) = hal->period_ticks;
+        TIM_CCR3(tim) = 0;
+        TIM_CCR1(tim) = 0;
+        TIM_CCR4(tim) = hal->period_ticks;
+        TIM_CCR2(tim) = hal->period_ticks;
         TIM_CCMR1(tim) = CCMR1_PRELOADED;
         TIM_CCMR2(tim) = CCMR2_PRELOADED;
     }

@@ -71,7 +71,7 @@ static noreturn void run(void) {
 
 /* Far enough below the present frame for the frames of the calls here. */
 __attribute__((noipa)) static void stack_paint(void) {
-    volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
+    const volatile uint32_t *const end = (uint32_t *)__builtin_frame_address(0) - 64;
     for (volatile uint32_t *word = stack_end; word < end; word++) {
         *word = HAL_STACK_UNUSED;
     }
@@ -80,8 +80,8 @@ __attribute__((noipa)) static void stack_paint(void) {
 __attribute__((used)) noreturn void program_start(void) {
     __asm__ volatile("cpsid i" ::: "memory");
     stack_paint();
-    memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
-    memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
+    (void)memcpy(data_start, data_load, (size_t)((char *)data_end - (char *)data_start));
+    (void)memset(bss_start, 0, (size_t)((char *)bss_end - (char *)bss_start));
     run();
 }
 

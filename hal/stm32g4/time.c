@@ -67,7 +67,7 @@ void hal_watchdog_start(hal_t *hal) {
     IWDG_KR = IWDG_UNLOCK;
     IWDG_PR = 0;
     IWDG_RLR = IWDG_COUNTS - 1u;
-    while (IWDG_SR & (IWDG_SR_PVU | IWDG_SR_RVU)) {
+    while ((IWDG_SR & (IWDG_SR_PVU | IWDG_SR_RVU)) != 0) {
     }
     hal_watchdog_kick(hal);
 }

@@ -223,7 +223,7 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         position->cubic_ticks = 0;
         go_to(position, command, to);
         if (!position->status.limited) {
-            begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to));
+            (void)begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to));
         }
         position->past[1] = position->past[0];
         position->past[0] = to;

@@ -10,10 +10,10 @@
 #define CONTROL_IRQ 31
 
 /* Armv7-M architecture reference manual, B3.4. */
-#define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100)
-#define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200)
-#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22) /* priority of PendSV */
-#define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400 + (irq)))
+#define NVIC_ISER0 (*(volatile uint32_t *)0xE000E100u)
+#define NVIC_ISPR0 (*(volatile uint32_t *)0xE000E200u)
+#define SCB_SHPR3_PENDSV (*(volatile uint8_t *)0xE000ED22u) /* priority of PendSV */
+#define NVIC_IPR(irq) (*(volatile uint8_t *)(0xE000E400u + (irq)))
 
 #define SYS_EXIT_EXTENDED 0x20
 #define ADP_STOPPED_APPLICATION_EXIT 0x20026

@@ -4,7 +4,7 @@
 #include "qemu/mps2_an386/timer.h"
 
 /* Armv7-M architecture reference manual, B3.2.4. */
-#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04)
+#define SCB_ICSR (*(volatile uint32_t *)0xE000ED04u)
 #define SCB_ICSR_PENDSVSET (UINT32_C(1) << 28)
 
 void hal_interrupt_request_deferred(hal_t *hal) {

@@ -11,8 +11,8 @@ typedef struct {
     uint32_t interrupt_clear;
 } cmsdk_timer_t;
 
-#define TRIGGER ((volatile cmsdk_timer_t *)0x40000000)
-#define COUNTER ((volatile cmsdk_timer_t *)0x40001000)
+#define TRIGGER ((volatile cmsdk_timer_t *)0x40000000u)
+#define COUNTER ((volatile cmsdk_timer_t *)0x40001000u)
 #define COUNTER_CLOCK_HZ 25000000
 #define CONTROL_ENABLE 1u
 #define CONTROL_INTERRUPT 8u
@@ -30,8 +30,10 @@ static uint32_t elapsed(void) {
 
 void timer_start(uint32_t period_ticks) {
     period = 2u * period_ticks / TICKS_PER_COUNT;
-    TRIGGER->reload = TRIGGER->value = period - 1u; /* the timer also counts 0 */
-    COUNTER->reload = COUNTER->value = UINT32_MAX;
+    TRIGGER->value = period - 1u; /* the timer also counts 0 */
+    TRIGGER->reload = period - 1u;
+    COUNTER->value = UINT32_MAX;
+    COUNTER->reload = UINT32_MAX;
     COUNTER->control = CONTROL_ENABLE;
     /* Read before the other timer starts, so that no trigger is later than its multiple of the period on the
      * counter. */

@@ -137,7 +137,7 @@ void board_interrupt_enable(void) {
 
 void board_interrupt_pend(void) {
     ACLINT_MSIP = 1;
-    while (ACLINT_MSIP) { /* the handler clears it */
+    while (ACLINT_MSIP != 0) { /* the handler clears it */
     }
 }
 
