@@ -1,7 +1,5 @@
 #include "rig/can_line.h"
 
-#define STUFF_ERROR_BITS 6 /* equal ones */
-#define ERROR_FLAG_BITS 6
 #define CRC_MARGIN_BITS 6 /* a disturbed bit is not among the last of the CRC: its error flag ends in stuffed bits */
 
 /* The present frame ends with an error flag of `flag_bits` after `bits` bits. */
@@ -89,7 +87,8 @@ void can_line_plan_frame(can_line_t *line, bool acknowledged, const can_length_t
     }
     line->bits = can_length_bits(lengths, &mailbox->frame);
     if (!acknowledged) {
-        plan_error(line, line->bits - CAN_WIRE_AFTER_ACKNOWLEDGE_BITS, CAN_WIRE_ACKNOWLEDGE_ERROR_FLAG_BITS);
+        /* No other node superposes a flag. */
+        plan_error(line, line->bits - CAN_WIRE_AFTER_ACKNOWLEDGE_BITS, CAN_WIRE_FLAG_BITS);
         line->acknowledge_error = true;
     } else if (mailbox->fault == CAN_FAULT_DUPLICATED) {
         line->bits_to_idle += CAN_WIRE_LAST_BIT_FLAG_BITS + CAN_WIRE_ERROR_DELIMITER_BITS;
@@ -111,6 +110,6 @@ void can_line_fall_silent(can_line_t *line, const can_node_t *node, unsigned bit
     }
     if (sends && line->remaining == 0) {
         line->acknowledge_error = false;
-        plan_error(line, bits + STUFF_ERROR_BITS, ERROR_FLAG_BITS);
+        plan_error(line, bits + CAN_WIRE_FLAG_BITS, CAN_WIRE_FLAG_BITS);
     }
 }

@@ -1,6 +1,5 @@
 #include "rig/can_wire.h"
 
-#define FLAG_BITS 6u
 #define STUFF_LIMIT 5u
 
 typedef struct {
@@ -62,10 +61,11 @@ unsigned can_wire_first_difference(const can_wire_t *left, const can_wire_t *rig
 
 unsigned can_wire_error_flag_bits(const can_wire_t *wire, unsigned index, unsigned level, bool passive) {
     unsigned run = 1;
-    while (run < FLAG_BITS && run <= index && wire->bit[index - run] == level) {
+    while (run < CAN_WIRE_FLAG_BITS && run <= index && wire->bit[index - run] == level) {
         ++run;
     }
     const unsigned flag_level = passive;
-    const unsigned until_receivers = run == FLAG_BITS ? 0 : level == flag_level ? FLAG_BITS - run : FLAG_BITS;
-    return until_receivers + FLAG_BITS;
+    const unsigned equal_before = level == flag_level ? run : 0;
+    const unsigned until_receivers = run == CAN_WIRE_FLAG_BITS ? 0 : CAN_WIRE_FLAG_BITS - equal_before;
+    return until_receivers + CAN_WIRE_FLAG_BITS;
 }

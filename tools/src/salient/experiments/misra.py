@@ -192,14 +192,9 @@ def addon() -> Path:
 
 def key(unit: Unit) -> str:
     """Hash of what the findings in a source depend on."""
-    line = [*unit.compiler, "-MM", *unit.options, unit.source]
-    listed = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
-    if listed.returncode != 0:
-        raise UsageError(f"{unit.source}: {listed.stderr.strip()[-1000:]}")
-    digest = hashlib.sha256(repr((unit, OPTIONS, tasks.file_digest(addon()))).encode())
+    compiled = tasks.compiled_digest([*unit.compiler, *unit.options], unit.source)
+    digest = hashlib.sha256(repr((unit, OPTIONS, tasks.file_digest(addon()), compiled)).encode())
     digest.update((inspect.getsource(analyse) + inspect.getsource(_by_addon)).encode())
-    for name in listed.stdout.partition(":")[2].replace("\\\n", " ").split():
-        digest.update((ROOT / name).read_bytes())
     return digest.hexdigest()[:16]
 
 

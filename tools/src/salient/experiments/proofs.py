@@ -186,14 +186,9 @@ def judge(arguments: tuple[Proof, list[str]]) -> dict[str, Any]:
 
 def key(proof: Proof) -> str:
     """Hash of what the result of a proof depends on."""
-    listed = subprocess.run(["gcc", "-MM", f"-I{HARNESSES}", *_includes(), proof.source], capture_output=True,
-                            text=True, check=False)
-    if listed.returncode != 0:
-        raise UsageError(f"{proof.source.name}: {listed.stderr.strip()[-1000:]}")
-    digest = hashlib.sha256(repr((proof.name, proof.bug.old, proof.bug.new, proof.unwind, OPTIONS)).encode())
-    for path in re.findall(r"\S+\.[chd]\w*", listed.stdout.partition(":")[2]):
-        digest.update(Path(path).read_bytes())
-    return digest.hexdigest()[:16]
+    compiled = tasks.compiled_digest(["gcc", f"-I{HARNESSES}", *_includes()], str(proof.source))
+    parts = (proof.name, proof.bug.old, proof.bug.new, proof.unwind, OPTIONS, compiled)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 def summary(found: Iterable[tuple[Proof, Mapping[str, Any]]]) -> dict[str, Any]:

@@ -96,6 +96,18 @@ def sources_digest(*names: str) -> str:
     return digest.hexdigest()
 
 
+def compiled_digest(compiler: Sequence[str], source: str) -> str:
+    """SHA-256 of a source and all that it includes. compiler: the command line up to the source, seen from the
+    repository's folder, from which `source` is named too. UsageError: the source cannot be preprocessed."""
+    listed = subprocess.run([*compiler, "-MM", source], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode != 0:
+        raise UsageError(f"{source}: {listed.stderr.strip()[-1000:]}")
+    digest = hashlib.sha256()
+    for name in listed.stdout.partition(":")[2].replace("\\\n", " ").split():
+        digest.update((ROOT / name).read_bytes())
+    return digest.hexdigest()
+
+
 def check_build(present: str, wanted: str) -> None:
     """RunFailed on a worker whose programs have another digest than on the computer that hands out the tasks."""
     if present != wanted:
