@@ -10,8 +10,6 @@
 #include "stm32g4/flash.h"
 #include "stm32g4/peripherals.h"
 
-#define PAGE_BYTES 1024u
-#define PAGE_WORDS (PAGE_BYTES / 4)
 #define ATTACHMENTS_MAX 64
 #define MESSAGE_RAM 0x4000A400u
 #define MESSAGE_RAM_BYTES 0x400u /* 3 x 212 words, of which the first instance has 0x350 bytes */
@@ -29,12 +27,6 @@ static const row_t rows[] = {
 };
 #define ROWS (sizeof rows / sizeof rows[0])
 
-/* Address ranges with registers, in pages. */
-static const struct {
-    uint32_t from, pages;
-} ranges[] = {{0x40000000u, 192}, {0x48000000u, 8}, {0x50000000u, 8}, {0x50060800u, 1}};
-#define PAGES (192 + 8 + 8 + 1)
-
 typedef struct {
     uint32_t base, size, enable;
     unsigned bit;
@@ -42,11 +34,12 @@ typedef struct {
     soc_write_t write;
 } attachment_t;
 
+uint32_t soc_words[SOC_PAGES][SOC_PAGE_WORDS];
+
 static struct {
-    uint32_t word[PAGE_WORDS];
-    uint16_t row[PAGE_WORDS];       /* 1 + index in rows; 0: none */
-    uint8_t attachment[PAGE_WORDS]; /* 1 + index; 0: not modelled */
-} pages[PAGES];
+    uint16_t row[SOC_PAGE_WORDS];       /* 1 + index in rows; 0: none */
+    uint8_t attachment[SOC_PAGE_WORDS]; /* 1 + index; 0: not modelled */
+} pages[SOC_PAGES];
 
 static attachment_t attachments[ATTACHMENTS_MAX];
 static unsigned attachment_count;
@@ -54,18 +47,6 @@ static unsigned attachment_count;
 #define ALTERED_MAX 8
 static struct { uint32_t address, clear, set; } altered[ALTERED_MAX];
 static unsigned altered_count;
-
-static int page_of(uint32_t address) {
-    unsigned first = 0;
-    for (unsigned i = 0; i < sizeof ranges / sizeof ranges[0]; ++i) {
-        const uint32_t page = (address - ranges[i].from) / PAGE_BYTES;
-        if (address >= ranges[i].from && page < ranges[i].pages) {
-            return (int)(first + page);
-        }
-        first += ranges[i].pages;
-    }
-    return -1;
-}
 
 void soc_violation(const char *format, ...) {
     char text[400];
@@ -79,17 +60,13 @@ void soc_violation(const char *format, ...) {
     exit(EXIT_VIOLATION);
 }
 
-uint32_t *soc_word(uint32_t address) {
-    const int page = page_of(address);
-    if (page < 0) {
-        soc_violation("address 0x%08X: no peripheral", address);
-    }
-    return &pages[page].word[address % PAGE_BYTES / 4];
+void soc_no_peripheral(uint32_t address) {
+    soc_violation("address 0x%08X: no peripheral", address);
 }
 
 static const row_t *row_of(uint32_t address) {
-    const int page = page_of(address);
-    const unsigned row = page < 0 ? 0 : pages[page].row[address % PAGE_BYTES / 4];
+    const unsigned page = soc_page(address);
+    const unsigned row = page == SOC_PAGES ? 0 : pages[page].row[address % SOC_PAGE_BYTES / 4];
     return row ? &rows[row - 1] : NULL;
 }
 
@@ -101,9 +78,9 @@ const char *soc_name(uint32_t address) {
 void soc_attach(uint32_t base, uint32_t size, uint32_t enable, unsigned bit, soc_read_t read, soc_write_t write) {
     attachments[attachment_count++] = (attachment_t){base, size, enable, bit, read, write};
     for (uint32_t address = base; address < base + size; address += 4) {
-        const int page = page_of(address);
-        if (page >= 0) {
-            pages[page].attachment[address % PAGE_BYTES / 4] = (uint8_t)attachment_count;
+        const unsigned page = soc_page(address);
+        if (page < SOC_PAGES) {
+            pages[page].attachment[address % SOC_PAGE_BYTES / 4] = (uint8_t)attachment_count;
         }
     }
 }
@@ -115,8 +92,8 @@ static bool is_message_ram(uint32_t address) {
 }
 
 static const attachment_t *checked(uint32_t address, unsigned size, const char *access, uint32_t value) {
-    const int page = page_of(address);
-    const unsigned number = page < 0 ? 0 : pages[page].attachment[address % PAGE_BYTES / 4];
+    const unsigned page = soc_page(address);
+    const unsigned number = page == SOC_PAGES ? 0 : pages[page].attachment[address % SOC_PAGE_BYTES / 4];
     if (!number || (!row_of(address) && !is_message_ram(address))) {
         soc_violation("%s of 0x%08X (%s), value 0x%X: not modelled", access, address, soc_name(address), value);
     }
@@ -254,9 +231,9 @@ void soc_request_reset(uint32_t cause) {
 
 static void registers_reset(void) {
     for (unsigned i = 0; i < ROWS; ++i) {
-        const int page = page_of(rows[i].address);
-        pages[page].row[rows[i].address % PAGE_BYTES / 4] = (uint16_t)(i + 1);
-        pages[page].word[rows[i].address % PAGE_BYTES / 4] = rows[i].reset;
+        const unsigned page = soc_page(rows[i].address);
+        pages[page].row[rows[i].address % SOC_PAGE_BYTES / 4] = (uint16_t)(i + 1);
+        soc_words[page][rows[i].address % SOC_PAGE_BYTES / 4] = rows[i].reset;
     }
 }
 
