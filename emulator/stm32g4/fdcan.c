@@ -292,6 +292,9 @@ static void error_state(void) {
     flags |= passive != can.was_passive ? IR_EP : 0;
     flags |= off != can.was_off ? IR_BO : 0;
     if (off && !can.was_off) {
+        if (can.joined) {
+            can.bus.room(can.bus.context); /* what ended before on the bus has been received */
+        }
         REG(CCCR) |= CCCR_INIT; /* the requests stay: they are sent after the return, unless CCE clears them */
         memset(can.sent, 0, sizeof can.sent);
         can.leaving = false;
