@@ -9,7 +9,7 @@
 #include "rig/can_length.h"
 
 #define CAN_WIRE_STUFFED_MAX 150 /* start of frame to CRC with stuff bits: 118 + 29, extended and eight bytes */
-#define CAN_WIRE_FLAG_BITS 6u /* error flag of one node; as many equal bits are a stuff error */
+#define CAN_WIRE_FLAG_BITS 6u    /* error flag of one node; as many equal bits are a stuff error */
 #define CAN_WIRE_ERROR_DELIMITER_BITS 8
 /* Error in the last bit of the end of frame: the transmitter's flag, one bit before the receivers' overload flags. */
 #define CAN_WIRE_LAST_BIT_FLAG_BITS 7
