@@ -84,9 +84,10 @@ static unsigned mapped_bytes(const canopen_t *canopen, unsigned pdo) {
 static void receive(canopen_t *canopen, const canopen_context_t *context, unsigned pdo, const hal_can_frame_t *frame) {
     canopen_rpdo_t *rpdo = &canopen->rpdo[pdo];
     const unsigned bytes = mapped_bytes(canopen, pdo), length = fixed_min_u32(frame->length, sizeof rpdo->data);
-    if (length != bytes) {
+    if (length != bytes && !rpdo->misfits) { /* once: a master sends its PDO again and again */
         canopen_emergency(canopen, length < bytes ? LENGTH_SHORT : LENGTH_LONG, FAULT_NONE);
     }
+    rpdo->misfits = length != bytes;
     if (length < bytes) {
         return;
     }

@@ -187,9 +187,10 @@ COLD void canopen_position_step(canopen_t *canopen, uint32_t elapsed_us, bool ha
         step_homing(canopen, halted);
     }
     const position_order_t order = wanted_order(canopen, halted);
-    if (order != position->order) {
+    if (order != position->order || (halted && !canopen->drive.halted)) { /* a halt acknowledges in a halt, too */
         publish(position, order);
     }
+    canopen->drive.halted = halted;
 }
 
 /* Software position limits, in the order of the drive's positions. */
@@ -222,6 +223,7 @@ COLD void canopen_position_command(const canopen_t *canopen, bool halted, positi
                                            -POSITION_MAX, POSITION_MAX);
         set_point->acceleration_rpm_s = set_point->deceleration_rpm_s = rate;
     } else if (position->order == POSITION_ORDER_HALT) {
+        set_point->acknowledges = true;
         const bool fast = halted && values[CANOPEN_VALUE_HALT_OPTION] == HALT_FAST;
         set_point->deceleration_rpm_s =
             canopen_rate(canopen, values[fast ? CANOPEN_VALUE_QUICK_STOP_DECELERATION : CANOPEN_VALUE_DECELERATION]);

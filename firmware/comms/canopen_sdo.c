@@ -135,5 +135,7 @@ COLD void canopen_sdo_receive(canopen_t *canopen, const canopen_context_t *conte
 }
 
 COLD void canopen_sdo_step(canopen_t *canopen, const canopen_context_t *context) {
-    canopen_sdo_block_step(canopen, context);
+    if (canopen->nmt != CANOPEN_NMT_STOPPED) {
+        canopen_sdo_block_step(canopen, context);
+    }
 }

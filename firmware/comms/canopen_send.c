@@ -20,10 +20,19 @@ COLD void canopen_send(canopen_t *canopen, const canopen_context_t *context, uin
     frame_queue_push(context->queue, &frame);
 }
 
-COLD void canopen_emergency(canopen_t *canopen, unsigned code, unsigned fault) {
-    if (canopen->emergencies < CANOPEN_EMERGENCIES) {
-        canopen->emergency[canopen->emergencies++] = (canopen_emergency_t){(uint16_t)code, (uint8_t)fault};
+static void remove_oldest(canopen_t *canopen) {
+    canopen->emergencies = (uint8_t)(fixed_min_u32(canopen->emergencies, CANOPEN_EMERGENCIES) - 1u);
+    for (unsigned i = 0; i < canopen->emergencies; i++) {
+        canopen->emergency[i] = canopen->emergency[i + 1u];
     }
+}
+
+/* The newest are kept: the last one tells the state that lasts. */
+COLD void canopen_emergency(canopen_t *canopen, unsigned code, unsigned fault) {
+    if (canopen->emergencies >= CANOPEN_EMERGENCIES) {
+        remove_oldest(canopen);
+    }
+    canopen->emergency[canopen->emergencies++] = (canopen_emergency_t){(uint16_t)code, (uint8_t)fault};
 }
 
 COLD void canopen_send_emergencies(canopen_t *canopen, const canopen_context_t *context, uint8_t error_register) {
@@ -36,8 +45,5 @@ COLD void canopen_send_emergencies(canopen_t *canopen, const canopen_context_t *
     const uint8_t data[8] = {(uint8_t)oldest->code, (uint8_t)(oldest->code >> 8), error_register, oldest->fault};
     canopen_send(canopen, context, EMERGENCY_ID + canopen->node, data, sizeof data);
     canopen->emergency_us = context->time_us;
-    canopen->emergencies = (uint8_t)(fixed_min_u32(canopen->emergencies, CANOPEN_EMERGENCIES) - 1u);
-    for (unsigned i = 0; i < canopen->emergencies; i++) {
-        canopen->emergency[i] = canopen->emergency[i + 1u];
-    }
+    remove_oldest(canopen);
 }

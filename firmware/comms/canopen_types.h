@@ -62,6 +62,7 @@ typedef struct {
 typedef struct {
     bool seen;        /* since it is valid; its event timer runs */
     bool waiting;     /* `data` is for the next SYNC */
+    bool misfits;     /* the last one had another length than its mapping */
     uint32_t time_us; /* of the last one */
     uint8_t data[8], length;
 } canopen_rpdo_t;
@@ -156,6 +157,7 @@ typedef struct {
     bool order_bit;     /* bit 4 likewise */
     uint16_t error;     /* error code of the last step */
     bool limited;       /* the demand is beyond what the drive does */
+    bool halted;        /* bit 8 of the controlword in the last step of a mode of position */
 } canopen_drive_t;
 
 /* Last telemetry cycle; LSBs of drive.dbc. */

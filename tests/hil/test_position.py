@@ -92,7 +92,7 @@ def test_a_new_target_in_a_move_is_taken_over_without_a_step(make_bench):
     assert bench.telemetry[POSITION].last == pytest.approx(-90, abs=2 * COUNT_DEG)
 
 
-@pytest.mark.parametrize("cycle_ms", [1, 4, 10])
+@pytest.mark.parametrize("cycle_ms", [1, 4, 10, 20])
 def test_a_cyclic_sine_is_followed_a_cycle_later(make_bench, cycle_ms):
     bench = running(make_bench)
     bench.drive.parameters["position_cycle_ms"] = cycle_ms
@@ -106,6 +106,29 @@ def test_a_cyclic_sine_is_followed_a_cycle_later(make_bench, cycle_ms):
     late = since_s > 0.3
     expected = amplitude_deg * np.sin(2 * math.pi * frequency_Hz * (since_s[late] - (cycle_ms + 1) * 1e-3))
     assert np.abs(angle[late] - expected).max() < 0.12
+
+
+@pytest.mark.parametrize("cycle_ms", [2, 10, 20])
+def test_cyclic_positions_that_come_late_or_after_a_jump_are_followed_on(make_bench, cycle_ms):
+    """A ramp of 300 r/min from a place 40 degrees away, every fourth position a millisecond late: the speed stays, and
+    the rotor is no further behind than a cycle and the delays."""
+    bench = running(make_bench)
+    bench.drive.parameters["position_cycle_ms"] = cycle_ms
+    begin_s, rate_deg_s, late_s = bench.time_s, 1800.0, 0.0
+    for number in range(round(0.8e3 / cycle_ms)):
+        bench.drive.follow_position(40.0 + rate_deg_s * number * cycle_ms * 1e-3)
+        next_s = 1e-3 if number % 4 == 3 else 0.0
+        bench.run_for(cycle_ms * 1e-3 + next_s - late_s)
+        late_s = next_s
+    angle, time_s = angle_deg(bench)
+    since_s = time_s - begin_s
+    behind_s = since_s - (angle - angle[0] - 40.0) / rate_deg_s
+    settled = since_s > 0.5
+    assert behind_s[settled].min() > 0.8e-3 * cycle_ms
+    assert behind_s[settled].max() < (cycle_ms + 4) * 1e-3
+    speed_rpm = bench.truth["speed_rpm"].value[bench.truth["speed_rpm"].time_s > begin_s + 0.5]
+    assert np.abs(speed_rpm - 300).max() < 45
+    assert (bench.drive.state, bench.drive.fault) == ("run", "none")
 
 
 @pytest.mark.parametrize("inertia_gain", [0.3, 2.0, 5.0])

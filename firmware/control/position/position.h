@@ -2,7 +2,8 @@
  *
  * A position is absolute over any number of turns, from the zero that the homing has set, or until then from the zero
  * of the encoder in the turn of the start. Forward rotation counts up. It has 2^-32 revolutions in 64 bits;
- * POSITION_MAX bounds set points to +-8192 revolutions, of which every difference fits.
+ * POSITION_MAX bounds set points to +-8192 revolutions, of which every difference fits. A rotor that turns further, by
+ * more than a revolution, begins a new range at 0 and is no longer homed.
  */
 #ifndef CONTROL_POSITION_POSITION_H
 #define CONTROL_POSITION_POSITION_H
@@ -37,6 +38,7 @@ typedef struct {
     position_homing_t homing;   /* of POSITION_ORDER_HOME */
     uint32_t sequence;          /* changes with each set point: two equal cyclic targets are two */
     bool bounded;               /* by lowest and highest */
+    bool acknowledges;          /* of POSITION_ORDER_HALT: each new sequence does, not its begin alone */
     int64_t target;             /* 2^-32 rev; of POSITION_ORDER_HOME: what the place found is called */
     int32_t speed_q22;          /* of the profile, rad/s times the unit of the machine's speeds, Q9.22, >= 0 */
     int32_t acceleration_rpm_s; /* r/min/s, >= 0 */

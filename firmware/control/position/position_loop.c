@@ -11,6 +11,9 @@
 
 #define TO_PROFILE 16 /* 2^-32 to 2^-48 rev */
 
+/* The jerk that is found in a tick acts in the next one, and leads to its end. */
+#define AHEAD_TICKS 2
+
 static int64_t limited(int64_t position) {
     return fixed_clamp_64(position, -POSITION_MAX, POSITION_MAX);
 }
@@ -19,10 +22,13 @@ static int64_t to_profile(int64_t position) {
     return position * (1 << TO_PROFILE);
 }
 
-/* 2^-32 rev, limited. */
-static int64_t present(const position_t *position, uint32_t encoder_angle, uint32_t angle) {
-    const int64_t counted = position->counted + (int32_t)(angle - encoder_angle);
-    return limited(counted - position->zero);
+/* Another zero, with which the reference and the rotor keep their places. */
+COLD NOINLINE static void move_zero(position_t *position, int64_t zero) {
+    const int64_t moved = to_profile(position->zero - zero);
+    position->zero = zero;
+    position->profile.start.x += moved;
+    position->profile.end.x += moved;
+    position->target += moved;
 }
 
 static void count(position_t *position, uint32_t encoder_angle, uint32_t angle) {
@@ -32,12 +38,13 @@ static void count(position_t *position, uint32_t encoder_angle, uint32_t angle) 
     } else {
         position->counted += (int32_t)(encoder_angle - position->encoder_angle);
     }
-    if (position->counted - position->zero > POSITION_MAX || position->counted - position->zero < -POSITION_MAX) {
-        position->zero = position->counted - (position->counted & (POSITION_ONE_REV - 1)); /* the range has ended */
+    const int64_t from_zero = position->counted - position->zero;
+    if (from_zero > POSITION_MAX + POSITION_ONE_REV || from_zero < -POSITION_MAX - POSITION_ONE_REV) {
+        move_zero(position, position->counted - (position->counted & (POSITION_ONE_REV - 1))); /* the range has ended */
         position->status.homed = false;
     }
     position->encoder_angle = encoder_angle;
-    position->status.position = present(position, encoder_angle, angle);
+    position->status.position = position->counted - position->zero + (int32_t)(angle - encoder_angle);
 }
 
 void position_follow(position_t *position, uint32_t encoder_angle, uint32_t angle) {
@@ -87,13 +94,8 @@ static void keep_within(position_t *position, const position_command_t *command)
 
 /* Calls the place `here` (counted, 2^-32 rev) by a name, and moves the reference with it. */
 COLD NOINLINE static void set_zero(position_t *position, int64_t here, int64_t name) {
-    const int64_t zero = here - name;
-    const int64_t moved = to_profile(position->zero - zero);
-    position->zero = zero;
-    position->profile.start.x += moved;
-    position->profile.end.x += moved;
-    position->target += moved;
-    position->status.position = limited(position->status.position + (moved >> TO_PROFILE));
+    position->status.position += position->zero - (here - name);
+    move_zero(position, here - name);
     position->status.homed = true;
 }
 
@@ -210,6 +212,22 @@ static int64_t speed_of_targets(const position_t *position, const position_cycle
     return profile_scale(position->targets < 3 ? 2 * before : 3 * before - earlier, cycle->half_per_ticks);
 }
 
+/* A reference that cannot reach the target in time aims at where the targets would stop, and this place moves on with
+ * them: aimed at a target, it would brake for it, and remain behind by the way of a stop. A step of the targets that is
+ * more than twice the one before is a jump. */
+COLD NOINLINE static void chase(position_t *position, const position_command_t *command, int64_t to) {
+    const int64_t step = to - position->past[0], before = position->past[0] - position->past[1];
+    const int64_t speed = 2 * profile_scale(step, command->cycle.half_per_ticks);
+    const bool moves_on = step > 0 ? before >= step >> 1 : step < 0 && before <= step >> 1;
+    const bool possible = speed <= command->limits.speed && speed >= -command->limits.speed;
+    position->chases = position->targets > 2 && moves_on && possible;
+    if (position->chases) {
+        const int64_t ticks = (int64_t)command->cycle.ticks - AHEAD_TICKS;
+        const profile_state_t then = {.x = to - speed * ticks, .v = speed};
+        position->target = fixed_clamp_64(profile_stop(&command->limits, &then), command->lowest, command->highest);
+    }
+}
+
 COLD NOINLINE static void follow_targets(position_t *position, const position_command_t *command, bool begins) {
     const int64_t to = to_profile(limited(command->set_point.target));
     if (begins) {
@@ -221,9 +239,11 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         position->targets += position->targets < 3;
         position->silent_ticks = 0;
         position->cubic_ticks = 0;
+        position->chases = false;
         go_to(position, command, to);
-        if (!position->status.limited) {
-            (void)begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to));
+        if (!position->status.limited &&
+            !begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to))) {
+            chase(position, command, to);
         }
         position->past[1] = position->past[0];
         position->past[0] = to;
@@ -235,6 +255,10 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         position->cubic_ticks = 0;
         position->targets = 0;
         stop(position, &command->limits);
+    } else if (position->chases) {
+        const int64_t step = position->past[0] - position->past[1];
+        position->target = fixed_clamp_64(position->target + 2 * profile_scale(step, command->cycle.half_per_ticks),
+                                          command->lowest, command->highest);
     } else if (position->cubic_ticks == 0 && position->targets > 1 && !position->stops &&
                position->profile.start.x == position->target) {
         position->cubic_ticks = 1; /* late: it goes on */
@@ -281,6 +305,11 @@ COLD NOINLINE static void follow_inertia(position_t *position, const position_co
     position->inertia_ratio_q14 = ratio_q14;
 }
 
+static bool acknowledged(const position_t *position, const position_set_point_t *set_point, bool begins) {
+    const bool comes = begins || (set_point->acknowledges && set_point->sequence != position->sequence);
+    return comes && set_point->order == POSITION_ORDER_HALT;
+}
+
 /* The order decides where the reference goes from this tick on. */
 COLD NOINLINE static void decide(position_t *position, const position_command_t *command,
                                  const position_sample_t *sample) {
@@ -290,7 +319,7 @@ COLD NOINLINE static void decide(position_t *position, const position_command_t 
     if (begins && position->homing != POSITION_HOMING_IDLE) {
         end_homing(position, false);
     }
-    if (begins && set_point->order == POSITION_ORDER_HALT) {
+    if (acknowledged(position, set_point, begins)) {
         position->status.following_error = false;
     }
     if (position->status.following_error || set_point->order == POSITION_ORDER_HALT) {
@@ -321,6 +350,7 @@ COLD NOINLINE static void tick(const position_law_t *parameters, position_t *pos
         profile->q = q;
         position->cubic_ticks--;
         if (position->cubic_ticks == 0) {
+            profile->start.x = position->target;
             profile->start.a = profile->q = 0; /* of the cubic; a profile begins without */
         }
     } else {

@@ -94,6 +94,7 @@ typedef struct {
     uint32_t phase; /* periods since the begin of the tick */
     int64_t target; /* of the profile, 2^-48 rev */
     bool stops;     /* target is where a stop ends */
+    bool chases;    /* target is where cyclic targets, as they move on, would stop */
     position_order_t order;
     uint32_t sequence;     /* of the last set point */
     int64_t past[2];       /* cyclic targets before the last one, 2^-48 rev */

@@ -238,6 +238,39 @@ TEST_F(CanopenPdo, a_pdo_without_a_mapping_is_none) {
     }
 }
 
+TEST_F(CanopenPdo, a_length_that_does_not_fit_is_one_emergency_and_hides_no_other) {
+    operational();
+    cycle();
+    sent();
+    unsigned lengths = 0, faults = 0;
+    const auto count = [&] {
+        for (const sent_t &frame : sent()) {
+            lengths += frame.identifier == 0x80u + NODE && frame.data[0] == 0x20 && frame.data[1] == 0x82;
+            faults += frame.identifier == 0x80u + NODE && frame.data[7] == 0 && frame.data[3] == FAULT_OVER_CURRENT;
+        }
+    };
+    for (unsigned i = 0; i < 20; i++) {
+        receive(0x200 + NODE, {0, 0, 0});
+        receive(0x200 + NODE, {0, 0, 0});
+        cycle();
+        count();
+    }
+    EXPECT_EQ(lengths, 1u);
+    write(0x1015, 0, 1000);
+    for (unsigned i = 0; i < 6; i++) {
+        receive(0x200 + NODE, {0, 0});
+        receive(0x200 + NODE, {0, 0, 0});
+    }
+    values.status.state = DRIVE_STATE_FAULT;
+    values.status.fault = FAULT_OVER_CURRENT;
+    for (unsigned i = 0; i < 1000; i++) {
+        cycle();
+        count();
+    }
+    EXPECT_EQ(lengths, 4u) << "what had no place with the inhibit time is the oldest";
+    EXPECT_EQ(faults, 1u);
+}
+
 TEST_F(CanopenPdo, a_pdo_that_is_not_valid_has_any_identifier) {
     EXPECT_EQ(write(0x1400, 1, int32_t(0x80000000u)), 0u);
     EXPECT_EQ(read(0x1400, 1), 0x80000000u);

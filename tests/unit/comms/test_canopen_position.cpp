@@ -350,6 +350,32 @@ TEST_F(CanopenPosition, a_following_error_is_bit_13_and_an_emergency_until_it_en
     EXPECT_EQ(status() & ERROR, 0u);
 }
 
+// The position loop takes an order halt with this mark for one that acknowledges when its sequence is new.
+TEST_F(CanopenPosition, a_following_error_while_the_drive_holds_is_acknowledged_by_a_halt_or_another_mode) {
+    begin(1);
+    for (const bool by_mode : {false, true, false}) {
+        const uint32_t before = command.position.sequence;
+        follow(5);
+        ASSERT_EQ(command.position.sequence, before);
+        if (by_mode) {
+            write(0x6060, 0, 6);
+        } else {
+            control(ENABLE | HALT);
+        }
+        follow(5);
+        EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+        EXPECT_TRUE(command.position.acknowledges);
+        EXPECT_EQ(command.position.sequence, before + 1);
+        control(ENABLE);
+        follow(5);
+        EXPECT_EQ(command.position.sequence, before + 1) << "not by the end of the halt";
+    }
+    write(0x6060, 0, 1);
+    follow(2);
+    set_point(UNITS);
+    EXPECT_FALSE(command.position.acknowledges);
+}
+
 TEST_F(CanopenPosition, stops_are_ramps_of_the_velocity) {
     for (unsigned word : {0x02u, 0x07u}) { // quick stop, disable operation
         begin(1);

@@ -233,6 +233,16 @@ TEST_F(CanopenSdo, block_upload_repeats_what_was_lost) {
     EXPECT_EQ(word(sdo({0xA4, 0x00, 0x2F, 0, 128, 0, 0, 0})), 0x05040002u);
 }
 
+TEST_F(CanopenSdo, a_stopped_node_sends_no_segments) {
+    sdo(head(0xA4, 0x2F00, 0, 127));
+    receive(0x600 + NODE, {0xA3, 0, 0, 0, 0, 0, 0, 0});
+    receive(0, {2, NODE});
+    cycle(10);
+    for (const sent_t &frame : sent()) {
+        EXPECT_NE(frame.identifier, 0x580u + NODE);
+    }
+}
+
 TEST_F(CanopenSdo, block_download_with_a_gap_is_continued_behind_it) {
     bytes_t data = parameter_bytes();
     const int32_t speed = 1500;

@@ -61,6 +61,15 @@ class PositionLoop : public testing::Test {
         command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
     }
 
+    void cyclic(double target_rev, uint32_t cycle_ms) {
+        position_set_point_t set_point = {};
+        set_point.order = POSITION_ORDER_CYCLIC;
+        set_point.cycle_ms = cycle_ms;
+        set_point.sequence = command.set_point.sequence + 1;
+        set_point.target = int64_t(std::llround(target_rev * REV_32));
+        command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
+    }
+
     position_sample_t sample() const {
         const auto angle = uint32_t(int64_t(std::llround(rotor_rev * REV_32)));
         const bool at_stop = rotor_rev <= lowest_rev || rotor_rev >= highest_rev;
@@ -409,6 +418,56 @@ TEST_F(PositionLoop, a_sender_of_cyclic_targets_that_ceases_is_a_stop_by_the_pro
     EXPECT_LT(rotor_rev - from, speed * 0.012 + speed * speed / 2.0 / 90.0 + speed * 0.015);
 }
 
+TEST_F(PositionLoop, targets_that_are_late_find_the_speed_of_those_before) {
+    for (const uint32_t cycle_ms : {1u, 2u, 4u, 7u, 20u}) {
+        const double cycle_s = 1e-3 * cycle_ms;
+        double target = rotor_rev;
+        for (int k = 0; k * cycle_s < 0.5; k++) {
+            target += 2.0 * cycle_s * std::min(1.0, k * cycle_s / 0.1);
+            cyclic(target, cycle_ms);
+            ticks(int(cycle_ms));
+        }
+        const double at = double(position.profile.start.x) / REV_48;
+        for (uint32_t tick = 1; tick <= 2 * cycle_ms - 1; tick++) {
+            ticks(1);
+            EXPECT_NEAR(double(position.profile.start.x) / REV_48, at + 2e-3 * tick, 1e-7) << cycle_ms << ", " << tick;
+        }
+        ticks(300);
+        EXPECT_NEAR(speed_rev_s, 0.0, 1e-3);
+    }
+}
+
+// A jump, and targets of which some come a tick late: the reference is soon where the targets are, and stays within the
+// limits.
+TEST_F(PositionLoop, targets_that_move_on_are_caught_up_with) {
+    std::mt19937 random(3);
+    int64_t speed = 0, acceleration = 0;
+    for (const int cycle_ms : {1, 2, 5, 10, 20}) {
+        for (const int jitter : {0, 1}) {
+            const double cycle_s = 1e-3 * cycle_ms;
+            double target = rotor_rev - 0.3, worst = 0.0;
+            int late = 0;
+            for (int k = 0; k * cycle_s < 2.0; k++) {
+                target += 4.0 * cycle_s;
+                cyclic(target, uint32_t(cycle_ms));
+                const int next = cycle_ms > 1 ? jitter * int(random() % 2) : 0;
+                for (int tick = late; tick < cycle_ms + next; tick++) {
+                    ticks(1);
+                    speed = std::max(speed, std::abs(position.profile.end.v));
+                    acceleration = std::max(acceleration, std::abs(position.profile.end.a));
+                }
+                late = next;
+                const double behind = target - double(position.profile.start.x) / REV_48;
+                worst = k * cycle_s > 1.0 ? std::max(worst, std::fabs(behind)) : worst;
+            }
+            EXPECT_LT(worst, 4.0 * (jitter * 0.003 + 0.0011)) << cycle_ms << ", " << jitter;
+            ticks(500);
+        }
+    }
+    EXPECT_LE(acceleration, parameters.plan.limits.acceleration + parameters.plan.limits.acceleration / 1000);
+    EXPECT_LE(speed, parameters.plan.limits.speed);
+}
+
 TEST_F(PositionLoop, a_following_error_is_a_controlled_stop_until_a_halt) {
     highest_rev = 2.0;
     order(POSITION_ORDER_PROFILE, 5.0);
@@ -426,6 +485,20 @@ TEST_F(PositionLoop, a_following_error_is_a_controlled_stop_until_a_halt) {
     order(POSITION_ORDER_PROFILE, 0.0);
     ticks(1000);
     EXPECT_NEAR(rotor_rev, 0.0, 1e-6);
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(5);
+    rotor_rev += 0.2; // while it holds
+    ticks(5);
+    EXPECT_TRUE(position.status.following_error);
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(5);
+    EXPECT_TRUE(position.status.following_error) << "a sender that repeats its order has not seen it";
+    command.set_point.acknowledges = true;
+    ticks(5);
+    EXPECT_TRUE(position.status.following_error);
+    command.set_point.sequence++;
+    ticks(5);
+    EXPECT_FALSE(position.status.following_error);
 }
 
 TEST_F(PositionLoop, homing_here_calls_the_place_the_target_and_moves_nothing) {
@@ -521,10 +594,58 @@ TEST_F(PositionLoop, the_end_of_the_range_of_positions_begins_a_new_one) {
         rotor_rev += 0.1;
         const position_sample_t next = sample();
         position_follow(&position, next.encoder_angle, next.angle);
-        ASSERT_LE(std::abs(position.status.position), POSITION_MAX);
+        ASSERT_LE(std::abs(position.status.position), POSITION_MAX + POSITION_ONE_REV);
+    }
+    for (int k = 0; k < 10; k++) {
+        rotor_rev += 0.1;
+        const position_sample_t next = sample();
+        position_follow(&position, next.encoder_angle, next.angle);
     }
     EXPECT_FALSE(position.status.homed);
     EXPECT_LT(position_rev(), 2.0);
+}
+
+TEST_F(PositionLoop, the_last_position_of_the_range_is_held) {
+    position_settings_t wide = settings();
+    wide.lowest_rev = -8192;
+    parameters = position_configure(&wide);
+    step();
+    order(POSITION_ORDER_HOME, -8191.9);
+    ticks(20);
+    const double end = rotor_rev - 0.1;
+    order(POSITION_ORDER_PROFILE, -8192.0);
+    ticks(500);
+    EXPECT_NEAR(rotor_rev, end, 1e-5);
+    rotor_rev -= 0.02; // as a load would
+    double slowest = 0.0;
+    for (int k = 0; k < 100; k++) {
+        ticks(1);
+        slowest = std::min(slowest, speed_rev_s);
+    }
+    EXPECT_GT(slowest, -0.01);
+    EXPECT_NEAR(rotor_rev, end, 1e-4);
+    EXPECT_NEAR(position_rev(), -8192.0, 1e-4);
+    EXPECT_TRUE(position.status.homed && !position.status.following_error);
+}
+
+TEST_F(PositionLoop, a_stop_is_sought_at_the_speed_of_the_homing_beyond_the_range) {
+    step();
+    position.zero = position.counted - POSITION_MAX; // it begins at the end
+    order(POSITION_ORDER_HALT, 0.0);
+    const position_sample_t now = sample();
+    position_follow(&position, now.encoder_angle, now.angle);
+    ticks(2);
+    order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_STOP_FORWARD);
+    double fastest = 0.0;
+    for (int k = 0; k < 2000; k++) {
+        ticks(1);
+        fastest = std::max(fastest, std::fabs(speed_rev_s));
+    }
+    EXPECT_LT(fastest, 2.1);
+    highest_rev = rotor_rev + 0.5;
+    ticks(1000);
+    EXPECT_TRUE(position.status.homed && !position.status.homing_failed);
+    EXPECT_NEAR(position_rev(), 0.0, 1e-4);
 }
 
 } // namespace

@@ -34,6 +34,10 @@ assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
 """Period of the commands in virtual time; the drive stops when they are no longer sent."""
 
+_CYCLE_MAX_NS = 20_000_000
+"""Longest position_cycle_ms. A cyclic position that is repeated is another target: it is repeated when the next one has
+not come after half a cycle more."""
+
 _DISARMED_NS = 2_000_000
 """Time in which a report that the drive is armed may be older than the command that has disarmed it."""
 
@@ -141,6 +145,8 @@ class Drive(KnownAttributes):
         self._position_command = session.drive_database.get_message_by_name(_POSITION_COMMAND.name)
         self._position_deg = 0.0
         self._order = "profile"
+        self._followed_ns = 0
+        self._cycle_ns = COMMAND_PERIOD_NS
         self._mode = "speed"
         self._experiment = Experiment("rest")
         self._experiment_number = 0
@@ -201,6 +207,10 @@ class Drive(KnownAttributes):
 
     def follow_position(self, position_deg: float) -> None:
         """The next one of cyclic positions, which come every position_cycle_ms."""
+        passed_ns = self._session.time_ns - self._followed_ns
+        ceased = passed_ns > 2 * _CYCLE_MAX_NS
+        self._cycle_ns = COMMAND_PERIOD_NS if ceased else min(max(passed_ns, COMMAND_PERIOD_NS), _CYCLE_MAX_NS)
+        self._followed_ns = self._session.time_ns
         self._order_position("cyclic", position_deg)
 
     def home(self, position_deg: float = 0.0) -> None:
@@ -326,7 +336,7 @@ class Drive(KnownAttributes):
         if self._mode == "position":
             self._session.send(position_command_frame(counter, self._request, self._order, self._position_deg,
                                                       self._position_command))
-            period_ns += COMMAND_PERIOD_NS // 2 if self._order == "cyclic" else 0  # not beside the next one
+            period_ns = self._cycle_ns * 3 // 2 if self._order == "cyclic" else period_ns
         elif self._mode == "experiment":
             self._session.send(self._experiment_frame(self._experiment, counter))
         elif self._mode == "torque":
