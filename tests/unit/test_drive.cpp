@@ -889,6 +889,23 @@ TEST_F(Drive, a_lost_phase_is_switched_off_where_that_is_allowed_until_a_fault_i
     }
 }
 
+TEST_F(Drive, a_lost_phase_comes_back_outside_of_the_run_when_running_without_it_is_no_longer_allowed) {
+    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+    periods(8);
+    command(COMMAND_RUN);
+    periods(8);
+    drive.degraded.lost = 2u;
+    drive.control.lost_phase = 2u;
+    send(COMMAND_OFF);
+    periods(8);
+    ASSERT_NE(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    EXPECT_EQ(drive.degraded.lost, 2u) << "allowed still";
+    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 0);
+    periods(8);
+    EXPECT_EQ(drive.degraded.lost, 0u);
+    EXPECT_EQ(drive.control.lost_phase, 0u);
+}
+
 TEST_F(Drive, a_position_command_reaches_the_interrupt_with_the_parameter_s_homing_and_telemetry_has_its_state) {
     const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
     ASSERT_TRUE(drive_init(&drive, &hal, &config));

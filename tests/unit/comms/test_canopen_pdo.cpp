@@ -341,6 +341,27 @@ TEST_F(CanopenPdo, nmt_heartbeat_and_guarding) {
     }
 }
 
+TEST_F(CanopenPdo, a_reset_of_communication_forgets_toggle_transfer_and_watched_nodes_and_keeps_the_profile) {
+    write(0x6083, 0, 4321);
+    write(0x1016, 1, 0x7F << 16 | 100);
+    receive(0x77F, {5});
+    receive(0x700 + NODE, {}, true);
+    ASSERT_TRUE(canopen.guard.watched && canopen.guard_toggle && canopen.consumer[0].watched);
+    ASSERT_EQ(sdo(head(0x40, 0x1008, 0))[0], 0x41) << "a text, by segments";
+    receive(0, {130, NODE});
+    EXPECT_FALSE(canopen.guard.watched || canopen.consumer[0].watched);
+    cycle();
+    sent();
+    EXPECT_EQ(code_of(sdo({0x60, 0, 0, 0, 0, 0, 0, 0})), 0x05040001u) << "no transfer goes on";
+    receive(0x700 + NODE, {}, true);
+    EXPECT_EQ(sent().front(), (sent_t{0x700 + NODE, {127}})) << "the toggle begins with 0";
+    EXPECT_EQ(read(0x1016, 1), 0u);
+    EXPECT_EQ(read(0x6083, 0), 4321u);
+    receive(0, {129, NODE});
+    cycle(2);
+    EXPECT_NE(read(0x6083, 0), 4321u) << "a reset of the node takes the profile's values";
+}
+
 TEST_F(CanopenPdo, lss_selects_and_sets_the_node) {
     const auto lss = [&](unsigned command, uint32_t value) {
         receive(0x7E5, {uint8_t(command), uint8_t(value), uint8_t(value >> 8), uint8_t(value >> 16),

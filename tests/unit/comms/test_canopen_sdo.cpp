@@ -291,6 +291,23 @@ TEST_F(CanopenSdo, a_client_that_is_gone_blocks_none_that_tries_again_and_again)
     EXPECT_EQ(response, head(0x43, 0x1000, 0, 0x00020192));
 }
 
+TEST_F(CanopenSdo, a_transfer_lasts_as_long_as_its_pauses_are_no_longer_than_a_second) {
+    for (const unsigned kind : {0x40u, 0x21u, 0xC6u}) { // upload, download, download of blocks
+        for (const uint32_t pause_us : {1000000u, 1000001u}) {
+            sdo({0x80, 0, 0, 0, 0, 0, 0, 0});
+            EXPECT_NE(sdo(head(kind, 0x2F00, 0, SET_BYTES))[0], 0x80);
+            const canopen_sdo_state_t begun = canopen.sdo.state;
+            for (unsigned segment = 0; segment < 5; segment++) {
+                time_us += pause_us;
+                const unsigned toggle = segment % 2 << 4;
+                sdo(kind == 0xC6 ? block_segment(parameter_bytes(), segment, segment + 1)
+                                 : bytes_t{uint8_t((kind == 0x40 ? 0x60 : 0) | toggle), 0, 0, 0, 0, 0, 0, 0});
+                EXPECT_EQ(canopen.sdo.state, pause_us > 1000000 ? CANOPEN_SDO_IDLE : begun) << kind << " " << segment;
+            }
+        }
+    }
+}
+
 TEST_F(CanopenSdo, parameters_are_stored_and_defaults_restored_with_the_node_kept) {
     EXPECT_EQ(write(0x2000 + PARAMETER_OVER_SPEED_RPM, 0, 2222), 0u);
     EXPECT_EQ(write(0x1010, 1, 0x65766173), 0u);

@@ -131,6 +131,36 @@ TEST(BpNetwork, initial_weights_are_within_one_half_and_depend_only_on_the_seed)
     EXPECT_EQ(first.hidden[0].input.value[1], int32_t(generated >> 4) - (1 << 27));
 }
 
+TEST(BpNetwork, a_reset_leaves_neither_weights_nor_increments_of_what_was_learned) {
+    std::mt19937 random(6);
+    bp_network_t fresh{}, used{};
+    bp_network_reset(&fresh, 1);
+    bp_network_reset(&used, 2);
+    for (int k = 0; k < 10; k++) {
+        const int32_t input_q27[BP_INPUTS] = {any_q27(random), any_q27(random), any_q27(random)};
+        const int32_t input_q31[BP_INPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
+        const int32_t sensitivity_q31[BP_OUTPUTS] = {any_q31(random), any_q31(random), any_q31(random)};
+        bp_network_forward(&used, input_q27);
+        bp_network_learn(&DEFAULTS, &used, 30000, input_q31, sensitivity_q31);
+    }
+    int learned = 0;
+    for (const bp_neuron_t &neuron : used.hidden) {
+        for (unsigned k = 0; k < 3; k++) {
+            learned += (neuron.input.increment[k] != 0) + (neuron.output.increment[k] != 0);
+        }
+    }
+    EXPECT_EQ(learned, 36);
+    bp_network_reset(&used, 1);
+    for (unsigned i = 0; i < BP_HIDDEN; i++) {
+        for (unsigned k = 0; k < 3; k++) {
+            EXPECT_EQ(used.hidden[i].input.value[k], fresh.hidden[i].input.value[k]);
+            EXPECT_EQ(used.hidden[i].output.value[k], fresh.hidden[i].output.value[k]);
+            EXPECT_EQ(used.hidden[i].input.increment[k], 0);
+            EXPECT_EQ(used.hidden[i].output.increment[k], 0);
+        }
+    }
+}
+
 // The difference is the error of the activations, 8e-5 (7e-4 for sums beyond 8), through the 6 weights of the next
 // layer.
 TEST(BpNetwork, outputs_equal_the_reference_model_for_small_and_for_saturated_weights) {

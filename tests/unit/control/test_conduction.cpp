@@ -363,6 +363,22 @@ TEST_F(Conduction, follows_its_model_through_the_transition_on_a_sagging_dc_link
     EXPECT_EQ(state.level_q15, 0);
 }
 
+// Between driving and braking below base speed, where each half has found a trim.
+TEST_F(Conduction, a_torque_in_the_other_direction_begins_without_the_trim_of_the_one_before) {
+    model_t model{tables};
+    unsigned changes = 0;
+    for (unsigned k = 0; k < 80; k++) {
+        const double sign = k / 20 % 2 == 0 ? 1.0 : -1.0;
+        const int32_t trim_q30 = state.trim_q30;
+        const sample_t s{sign * 26.0, sign * 23.0, sign * 0.8, 100.0, SUPPLY_V, 0.08};
+        update(s);
+        model.update(s);
+        compare(model, "update " + std::to_string(k));
+        changes += k > 0 && k % 20 == 0 && std::abs(trim_q30) > 1 << 26 && std::abs(state.trim_q30) < 1 << 24;
+    }
+    EXPECT_EQ(changes, 3u);
+}
+
 TEST_F(Conduction, is_the_same_in_both_directions_but_for_signs) {
     conduction_state_t forward{};
     const sample_t ahead{20.0, 19.0, 0.5, 250.0, 230.0, 0.08};

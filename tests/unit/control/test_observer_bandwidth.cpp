@@ -157,6 +157,19 @@ TEST(ObserverBandwidth, an_innovation_above_1_25_counts_or_8_urad_of_an_edge_tri
     EXPECT_EQ(ideal.schedule.trigger_stage_count, 0) << "triggers the full transient bandwidth";
 }
 
+TEST(ObserverBandwidth, the_time_since_a_trigger_does_not_come_round_and_the_next_one_comes_as_soon) {
+    Bandwidth bandwidth(configure());
+    bandwidth.settle();
+    for (const uint32_t ticks : {(1u << 24) - 1u, uint32_t(INT32_MAX) - 1u, uint32_t(INT32_MAX)}) {
+        bandwidth.state.ticks = ticks;
+        ASSERT_FALSE(bandwidth.step(0));
+        EXPECT_EQ(bandwidth.state.ticks, std::min(ticks + 1u, uint32_t(INT32_MAX)));
+        EXPECT_TRUE(bandwidth.steady());
+        EXPECT_TRUE(bandwidth.step(2 * COUNT)) << ticks;
+        bandwidth.settle();
+    }
+}
+
 TEST(ObserverBandwidth, equal_transient_and_steady_bandwidths_never_trigger) {
     Bandwidth bandwidth(configure(STEADY_RAD_S));
     for (const int32_t innovation : {0, COUNT, -(1 << 27), (1 << 27) - 1}) {
@@ -227,6 +240,19 @@ TEST(ObserverBandwidth, triggers_extend_the_holdoff_to_at_most_256_ms) {
             EXPECT_LE(bandwidth.limits.holdoff_ticks * 1e3 / rate_hz, 256.0) << rate_hz;
         }
         EXPECT_GT(bandwidth.limits.holdoff_ticks * 1e3 / rate_hz, 255.0) << rate_hz;
+    }
+}
+
+TEST(ObserverBandwidth, a_trigger_in_steady_state_doubles_the_extension_and_one_in_the_decay_adds_a_quarter) {
+    for (const auto &[trigger, factor] : {std::pair{OBSERVER_TRIGGER_IN_STEADY_STATE, 2.0},
+                                          {OBSERVER_TRIGGER_IN_DECAY, 1.25},
+                                          {OBSERVER_TRIGGER_NONE, 1.0}}) {
+        Bandwidth bandwidth(configure());
+        bandwidth.statistics.holdoff_extension_q16 = 8u << 16;
+        bandwidth.state.trigger = trigger;
+        bandwidth.update(0, false);
+        const double increment = trigger == OBSERVER_TRIGGER_NONE ? 0.0 : 0.25;
+        EXPECT_NEAR(bandwidth.statistics.holdoff_extension_q16 / 65536.0, 8.0 * factor + increment, 0.01) << factor;
     }
 }
 

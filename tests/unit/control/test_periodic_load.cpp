@@ -371,6 +371,12 @@ TEST(PeriodicLoad, the_mean_over_a_pole_pitch_begins_anew_where_the_angle_jumps)
     EXPECT_EQ(turn(0.7), load.window_q8);
     EXPECT_EQ(load.window, unsigned(PITCH));
     EXPECT_NE(load.window_q8, 0);
+    turn(1.0 - double(load.count) / VALUES); // to the end of a turn, with its step
+    const uint32_t before = load.index;
+    periodic_load_reset(&load);
+    turn(5.5 / VALUES);
+    ASSERT_NE(load.index, before) << "it goes on within the same value";
+    EXPECT_EQ(load.window, load.count) << "after a reset, too, only its own values count";
 }
 
 TEST(PeriodicLoad, the_window_of_a_pole_pitch_is_the_nearest_number_of_values) {

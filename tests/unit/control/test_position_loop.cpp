@@ -136,6 +136,28 @@ TEST_F(PositionLoop, no_limit_of_a_set_point_exceeds_those_of_the_parameters) {
     EXPECT_EQ(less.limits.deceleration, parameters.plan.limits.deceleration);
 }
 
+TEST_F(PositionLoop, acceleration_and_deceleration_have_each_their_own_limit) {
+    const double per_rpm_s = REV_48 * 1e-6 / 60.0;
+    for (const auto &[up, down] : {std::pair{3000, 9000}, {9000, 3000}}) {
+        position_settings_t of = settings();
+        of.acceleration_rpm_s = up;
+        of.deceleration_rpm_s = down;
+        parameters = position_configure(&of);
+        EXPECT_NEAR(double(parameters.plan.limits.acceleration), up * per_rpm_s, REV_48 * 1e-9);
+        EXPECT_NEAR(double(parameters.plan.limits.deceleration), down * per_rpm_s, REV_48 * 1e-9);
+        for (const auto &[wanted_up, wanted_down] : {std::pair{0, INT32_MAX}, {INT32_MAX, 0}, {600, 1200}, {1200, 0}}) {
+            position_set_point_t set_point = {};
+            set_point.acceleration_rpm_s = wanted_up;
+            set_point.deceleration_rpm_s = wanted_down;
+            const position_command_t made = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
+            const int expected_up = wanted_up > 0 ? std::min(wanted_up, up) : up;
+            const int expected_down = wanted_down > 0 ? std::min(wanted_down, down) : down;
+            EXPECT_NEAR(double(made.limits.acceleration), expected_up * per_rpm_s, REV_48 * 1e-9) << up;
+            EXPECT_NEAR(double(made.limits.deceleration), expected_down * per_rpm_s, REV_48 * 1e-9) << up;
+        }
+    }
+}
+
 TEST_F(PositionLoop, an_inertia_that_has_become_known_bounds_the_acceleration) {
     position_settings_t of = settings();
     of.acceleration_rpm_s = of.deceleration_rpm_s = of.jerk_rpm_s2 = 0;
@@ -541,6 +563,22 @@ TEST_F(PositionLoop, homing_by_a_stop_finds_it_and_holds_there) {
     order(POSITION_ORDER_PROFILE, 1.5);
     ticks(1000);
     EXPECT_NEAR(rotor_rev, -0.4, 1e-4);
+}
+
+TEST_F(PositionLoop, a_homing_by_a_stop_counts_its_50_ms_anew_after_one_that_was_given_up) {
+    lowest_rev = rotor_rev;
+    for (unsigned trial = 0; trial < 2; trial++) {
+        order(POSITION_ORDER_HOME, 0.5, POSITION_HOMING_STOP_BACKWARD);
+        ticks(45);
+        ASSERT_TRUE(position.status.homing) << trial;
+        if (trial == 0) {
+            order(POSITION_ORDER_HALT, 0.0);
+            ticks(2);
+        }
+    }
+    ticks(10);
+    EXPECT_TRUE(position.status.homed);
+    EXPECT_FALSE(position.status.homing || position.status.homing_failed);
 }
 
 TEST_F(PositionLoop, a_homing_that_another_order_or_the_end_of_the_run_interrupts_has_failed) {

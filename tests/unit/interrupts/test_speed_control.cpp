@@ -107,6 +107,38 @@ TEST_F(SpeedControl, the_course_of_slow_counts_begins_at_the_angle_and_fast_coun
     EXPECT_GT(torque_q24(true, true, 0), 0) << "a course that is ahead";
 }
 
+TEST_F(SpeedControl, a_run_begins_at_the_speed_of_the_rotor_and_with_one_quadrant_not_below_0) {
+    for (const drive_controller_t controller : {DRIVE_CONTROLLER_TRADITIONAL, DRIVE_CONTROLLER_SALIENT}) {
+        parameters = configured(controller, 40000, 17);
+        parameters.speed_ramp_q22 = 1 << 10;
+        const bool backwards = controller == DRIVE_CONTROLLER_SALIENT;
+        for (const int32_t speed_q22 : {-(20 << 22), -1, 0, 20 << 22}) {
+            for (const drive_mode_t mode : {DRIVE_MODE_SPEED, DRIVE_MODE_TORQUE}) {
+                for (const bool run : {false, true}) { // before
+                    control_reset(&parameters, &state);
+                    state.deferred.run = run;
+                    state.deferred.speed_reference_q22 = 7 << 22;
+                    deferred_input_t input{};
+                    input.run = true;
+                    input.speed_q22 = speed_q22;
+                    input.dc_link_voltage_q6 = 240 << 6;
+                    command_t command{};
+                    command.request = COMMAND_RUN;
+                    command.mode = mode;
+                    command.speed_reference_q22 = 60 << 22;
+                    deferred_results_t results{};
+                    speed_control_deferred(&parameters, &state.deferred, &input, &command, INT32_MAX, &results);
+                    const int32_t present_q22 = backwards ? speed_q22 : std::max(speed_q22, 0);
+                    const int32_t expected_q22 = mode == DRIVE_MODE_TORQUE ? present_q22
+                                                 : run                     ? (7 << 22) + (1 << 10)
+                                                                           : present_q22 + (1 << 10);
+                    EXPECT_EQ(state.deferred.speed_reference_q22, expected_q22) << controller << " " << speed_q22;
+                }
+            }
+        }
+    }
+}
+
 TEST_F(SpeedControl, a_full_dc_link_takes_the_torque_against_the_speed_of_a_rotor_that_turns_and_none_else) {
     deferred_input_t input{};
     input.run = true;

@@ -285,6 +285,27 @@ TEST_F(PhaseEvidenceInTurn, one_phase_that_differs_while_another_does_not_conduc
     EXPECT_EQ(periods_with(1, 2, 1), -1);
 }
 
+// Differences that change their side every few periods, of 256 in a revolution: too much flux linkage and too little.
+// [SR-30]
+TEST_F(PhaseEvidence, a_difference_that_changes_its_side_within_a_32nd_of_a_revolution_is_no_doubt) {
+    for (const int periods : {4, 7, 12}) {
+        monitor = {};
+        uint32_t doubted = 0;
+        EXPECT_EQ(periods_to_fault(500,
+                                   [&](int k) {
+                                       doubted |= monitor.phases_by_current.doubted;
+                                       input.electrical += 1u << 24;
+                                       const uint32_t angle = input.electrical;
+                                       const bool conducts = angle >= MIDDLE && angle < MIDDLE + (1u << 29);
+                                       const double factor = k / periods % 2 == 0 ? 1.5 : 0.1;
+                                       set(0, conducts ? 10.0 : 0.0, conducts ? factor * table_Wb(10.0) : 0.0);
+                                       input.off[0] = !conducts;
+                                   }),
+                  -1);
+        EXPECT_EQ(doubted, periods > 8 ? 1u : 0u) << periods;
+    }
+}
+
 // [SR-30]
 TEST_F(PhaseEvidence, after_a_lost_trigger_the_integral_is_that_of_the_tables_and_no_fault) {
     input.electrical = MIDDLE;

@@ -146,6 +146,28 @@ TEST(Overload, lasts_until_the_load_is_below_90_percent) {
     EXPECT_NEAR(gone_s - tripped_s, 10.0 * std::log(1.0 / 0.9), 0.02);
 }
 
+TEST(Overload, of_the_winding_and_of_the_switches_begin_and_end_each_by_its_own_load) {
+    const auto parameters = configure({20.0, 79.0, 10});
+    const int32_t current_q9[HAL_PHASES_MAX] = {};
+    for (const bool winding : {true, false}) {
+        thermal_t thermal{};
+        int64_t *load_q56 = winding ? thermal.winding_q56 : thermal.switches_q56;
+        int64_t *other_q56 = winding ? thermal.switches_q56 : thermal.winding_q56;
+        const uint64_t fault = FAULT_BIT(winding ? FAULT_WINDING_OVERLOAD : FAULT_INVERTER_OVERLOAD);
+        const auto faults = [&](double load, double other) {
+            load_q56[1] = int64_t(load * 0x1p56);
+            other_q56[1] = int64_t(other * 0x1p56);
+            thermal_sample(&parameters, &thermal, current_q9, thermal.step_us + 1000);
+            return thermal_faults(&thermal);
+        };
+        EXPECT_EQ(faults(0.99, 0.95), 0u);
+        EXPECT_EQ(faults(1.01, 0.95), fault) << "the other one has not been overloaded";
+        EXPECT_EQ(faults(0.91, 0.99), fault);
+        EXPECT_EQ(faults(0.89, 0.95), 0u);
+        EXPECT_EQ(faults(0.91, 0.0), 0u) << "it has ended";
+    }
+}
+
 TEST(Derating, is_smooth_and_linear_from_90_to_100_percent) {
     const auto parameters = configure({20.0, 79.0, 1});
     int32_t before_q24 = 20 << 24;

@@ -428,6 +428,25 @@ TEST_F(NvmStore, a_fault_is_logged_once_and_the_same_fault_after_a_clearing_agai
 }
 
 // [SR-60]
+TEST_F(NvmStore, a_fault_that_the_memory_does_not_take_is_given_up_after_its_attempts_and_holds_up_nothing) {
+    memory.hal.worn_page = FAULT_PAGE;
+    const fault_record_t record = fault_of(1);
+    nvm_store_follow_fault(&drive.store, &record);
+    parameter_store_save(&drive.store);
+    for (unsigned attempt = 1; attempt <= NVM_RING_ATTEMPTS; attempt++) {
+        EXPECT_EQ(drive.store.waiting_count, 1) << attempt;
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, record.time_us, true);
+    }
+    EXPECT_EQ(drive.store.waiting_count, 0);
+    EXPECT_EQ(nvm_store_newest_fault(&drive.store), 0u);
+    for (unsigned word = 0; word < SET_WORDS; word++) {
+        EXPECT_EQ(drive.store.saving, NVM_STORE_SAVING) << word;
+        nvm_store_step(&drive.store, &memory.hal, &drive.parameters, record.time_us, true);
+    }
+    EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
+}
+
+// [SR-60]
 TEST_F(NvmStore, two_faults_that_wait_are_both_logged_in_their_order) {
     for (const uint32_t number : {1u, 2u}) {
         const fault_record_t record = fault_of(number);

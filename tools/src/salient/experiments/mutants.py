@@ -5,7 +5,8 @@
 The operators are from DeMillo, Lipton and Sayward ("Hints on test data selection", IEEE Computer 11(4), 1978) as
 far as C of this kind has a use for them (OPERATORS). Of the places in a file a sample is drawn by the seed, so that
 another seed judges others; without --per-file all. A mutant is compiled and linked as a planted bug is (planted.py),
-and judged by the unit tests of its module, by those that include its header, and by tests/unit/test_drive.cpp:
+and judged by the unit tests of its module, by those that include its header, by its family (tests in the same folder
+whose names begin with the same word, as the tests of CANopen), and by tests/unit/test_drive.cpp:
 
     killed        a test fails, or takes more than TEST_MAX_S
     equivalent    the compiler makes the same code of it
@@ -137,13 +138,17 @@ def mutants(file: str, root: Path | None = None) -> list[Mutant]:
 
 @cache
 def finders(file: str) -> tuple[str, ...]:
-    """Programs of unit tests that judge a source: its own, those that include its header, the whole drive."""
+    """Programs of unit tests that judge a source: its own, those that include its header, its family (same folder, same
+    first word), the whole drive."""
     header = file.partition("/")[2].removesuffix(".c") + ".h"
     own = "test_" + header.removesuffix(".h").replace("/", "_")
+    folder, _, name = header.removesuffix(".h").rpartition("/")
     found = [planted.unit_program(path) for path in sorted(planted.UNIT.rglob("test_*.cpp"))
              if f'#include "{header}"' in path.read_text(encoding="utf-8")]
+    family = [planted.unit_program(path) for path in sorted((planted.UNIT / folder).glob("test_*.cpp"))
+              if path.stem.split("_")[1] == name.partition("_")[0]]
     built = _built()
-    return tuple(dict.fromkeys(program for program in (own, *found, _WHOLE_DRIVE) if program in built))
+    return tuple(dict.fromkeys(program for program in (own, *found, *family, _WHOLE_DRIVE) if program in built))
 
 
 @cache
