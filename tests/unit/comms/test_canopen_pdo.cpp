@@ -383,7 +383,9 @@ TEST_F(CanopenPdo, lss_selects_and_sets_the_node) {
     EXPECT_EQ(lss(0x11, 128)[1], 1);
     EXPECT_EQ(lss(0x11, 42)[1], 0);
     EXPECT_EQ(lss(0x13, 0)[1], 1) << "bit rate";
+    EXPECT_NE(store.saving, NVM_STORE_SAVING);
     EXPECT_EQ(lss(0x17, 0)[1], 0);
+    EXPECT_EQ(store.saving, NVM_STORE_SAVING) << "beyond the next start";
     EXPECT_EQ(parameters.values[PARAMETER_PROTOCOL], 42);
     EXPECT_EQ(canopen.node, NODE);
     receive(0, {130, 0});
