@@ -18,6 +18,9 @@ from salient.paths import BUILD, OUT, make_folder, scenario_path
 def main() -> int:
     """Runs a command; returns the exit code: 0 done, 1 the thing tested failed, 2 a mistake of the caller."""
     without_mf4()
+    # Matrices are small: on a loaded computer threads of the linear algebra wait for one another, for seconds instead
+    # of milliseconds. Processes share the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = argparse.Namespace()
     return exit_code(lambda: _run_command(options), lambda: _place(options))
 

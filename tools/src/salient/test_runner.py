@@ -318,10 +318,8 @@ def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequen
     report.unlink(missing_ok=True)
     if processes:
         options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
-    # The processes share the cores: threads of NumPy's linear algebra would only wait for one another.
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                     f"--junitxml={report}", *options, *files, quiet=quiet,
-                     environment={"OPENBLAS_NUM_THREADS": "1"})
+                     f"--junitxml={report}", *options, *files, quiet=quiet)
     count = _read_report(report)
     # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
