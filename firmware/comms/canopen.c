@@ -176,7 +176,7 @@ COLD void canopen_receive(canopen_t *canopen, const canopen_context_t *context, 
 
 static void watch(canopen_t *canopen, const canopen_context_t *context, canopen_watch_t *watch, uint32_t limit_us) {
     if (watch->watched && limit_us != 0 && context->time_us - watch->time_us > limit_us) {
-        *watch = (canopen_watch_t){.lost = true};
+        *watch = (canopen_watch_t){0}; /* until the next sign of life */
         canopen_drive_lose_master(canopen, context, CANOPEN_MASTER_SILENT);
     }
 }

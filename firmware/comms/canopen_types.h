@@ -76,7 +76,7 @@ typedef struct {
 } canopen_tpdo_t;
 
 typedef struct {
-    bool watched, lost;
+    bool watched;
     uint32_t time_us;
 } canopen_watch_t;
 
