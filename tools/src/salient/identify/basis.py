@@ -79,13 +79,22 @@ class FluxBasis:
         return np.asarray(result).reshape(angle_rad.shape)
 
     @cached_property
-    def roughness(self) -> tuple[np.ndarray, np.ndarray]:
-        """Quadratic forms of the third differences over the angle, with its symmetry, and over the current."""
+    def _across(self) -> np.ndarray:
+        """Third differences over the angle, with its symmetry, of coefficients of the angles."""
         order = 3
         mirrored = np.zeros((self.rows + 2 * order, self.rows))
         for row in range(self.rows + 2 * order):
             at = abs(row - order)
             mirrored[row, 2 * self.angles - at if at > self.angles else at] = 1.0
-        across = np.diff(mirrored, order, axis=0)
-        along = np.diff(np.eye(self.columns), order, axis=0)
-        return (np.kron(across.T @ across, np.eye(self.columns)), np.kron(np.eye(self.rows), along.T @ along))
+        return np.asarray(np.diff(mirrored, order, axis=0))
+
+    def bends(self, coefficients: np.ndarray) -> np.ndarray:
+        """Mean squares over the currents of the third differences over the angle, where `roughness` has weights."""
+        return np.asarray(np.mean((self._across @ coefficients.reshape(self.rows, self.columns)) ** 2, axis=1))
+
+    def roughness(self, weights: np.ndarray | None = None) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+        """Quadratic forms of the third differences over the angle, each with a weight, and over the current."""
+        across = self._across if weights is None else self._across * np.sqrt(weights)[:, None]
+        along = np.diff(np.eye(self.columns), 3, axis=0)
+        return (sparse.kron(across.T @ across, sparse.eye(self.columns)).tocsr(),
+                sparse.kron(sparse.eye(self.rows), along.T @ along).tocsr())

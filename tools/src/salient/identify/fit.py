@@ -25,13 +25,18 @@ from salient.identify.basis import FluxBasis
 from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
 from salient.identify.sequence import Findings, Pulse
 
-ANGLES, CURRENTS = 48, 24
+ANGLES, CURRENTS = 96, 24
+"""Steps of the spline over half a rotor pitch, as many as the loader's (salient.machine.flux_map), and over the
+current."""
 _ITERATIONS, _SMOOTHED = 5, 3
 """Iterations, and the one in which the smoothness is found: angles, delay and offsets are known then, whose errors
 would ask for a smoother map."""
-_ANGLE_WEIGHTS, _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1), (1e-4, 1e-3, 1e-2, 0.1)
+_ANGLE_WEIGHTS = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3, 1e4)
+_CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
+_FLAT_PART = 0.01
+"""Part of the mean square bend that is added to each: angles with less bend have nearly the same stiffness."""
 _FOLDS, _ROUGHER = 4, 0.1
 _EXACT_PART = 0.1
 """Least part of the residual that is not of the current's noise."""
@@ -117,7 +122,8 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
 class Fit:
     """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
     device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest;
-    conductance_S: of the iron; smoothness: weights of the roughness over angle and current."""
+    conductance_S: of the iron; smoothness: weights of the roughness over angle and current; stiffness: of its bends
+    over the angle, or None of an equal one."""
 
     basis: FluxBasis
     coefficients: np.ndarray
@@ -130,6 +136,7 @@ class Fit:
     conductance_S: float
     residual_Wb: np.ndarray
     smoothness: tuple[float, float] = (1e-3, 1e-3)
+    stiffness: np.ndarray | None = None
 
     def flux_Wb(self, angle_rad: np.ndarray, current_A: np.ndarray) -> np.ndarray:
         """Flux linkage at an angle from aligned."""
@@ -159,34 +166,47 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
     for iteration in range(_ITERATIONS):
         problem = _problem(rows, phases, fit, linear=iteration == 0)
         if iteration == _SMOOTHED:
-            fit = replace(fit, smoothness=_smoothness(problem, rows))
-            problem = _problem(rows, phases, fit, linear=False)
+            problem = _smoothed(problem, rows)
+            even = _solution(problem, rows, phases)
+            problem = _smoothed(replace(problem, fit=replace(problem.fit, stiffness=_stiffness(even))), rows)
         fit = _solution(problem, rows, phases)
     return fit
 
 
+def _smoothed(problem: _Problem, rows: Rows) -> _Problem:
+    """The problem with the smoothness that predicts best."""
+    return replace(problem, fit=replace(problem.fit, smoothness=_smoothness(problem, rows)))
+
+
+def _stiffness(fit: Fit) -> np.ndarray:
+    """Weights of the bends over the angle by the bends of a map, with a mean of 1: where poles begin to overlap the
+    torque has corners, which one smoothness of all angles either rounds or pays for with noise at the others."""
+    bends = fit.basis.bends(fit.coefficients)
+    stiffness = 1.0 / (bends + _FLAT_PART * np.mean(bends))
+    return np.asarray(stiffness / np.mean(stiffness))
+
+
 def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
     """Weights of the roughness by prediction of each pulse from the pulses of other folds, of the linear problem."""
-    n = problem.fit.basis.size
     folds = []
     for fold in range(_FOLDS):
         kept = rows.pulse % _FOLDS == fold
         design, weights, flux = problem.design[kept], problem.weights[kept], rows.flux_Wb[kept]
         weighted = design.multiply(weights[:, None]).tocsr()
-        folds.append((design, weights, flux, (weighted.T @ design).toarray(), weighted.T @ flux))
+        folds.append((design, weights, flux, (weighted.T @ design).tocsr(), weighted.T @ flux))
     normal, right = sum(each[3] for each in folds), sum(each[4] for each in folds)
-    best = (math.inf, problem.fit.smoothness)
-    for by_angle in _ANGLE_WEIGHTS:
-        for by_current in _CURRENT_WEIGHTS:
-            forms = _forms(problem, (by_angle, by_current))
-            error = 0.0
-            for design, weights, flux, of_normal, of_right in folds:
-                other = normal - of_normal + np.diag(problem.ridge)
-                other[:n, :n] += forms
-                x = linalg.solve(other, right - of_right + problem.pull, assume_a="pos", check_finite=False)
-                error += float(weights @ (flux - design @ x)**2)
-            best = min(best, (error, (by_angle, by_current)))
-    return best[1]
+
+    def error(smoothness: tuple[float, float]) -> float:
+        of_all = normal + sparse.diags(problem.ridge) + _forms(problem, smoothness)
+        total = 0.0
+        for design, weights, flux, of_normal, of_right in folds:
+            x = _solved(of_all - of_normal, right - of_right + problem.pull, problem.fit.basis)
+            total += float(weights @ (flux - design @ x)**2)
+        return total
+
+    by_angle, by_current = problem.fit.smoothness
+    by_angle = min(_ANGLE_WEIGHTS, key=lambda weight: error((weight, by_current)))
+    return by_angle, min(_CURRENT_WEIGHTS, key=lambda weight: error((by_angle, weight)))
 
 
 def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -223,11 +243,34 @@ def _signs(basis: FluxBasis) -> sparse.csr_matrix:
     return sparse.vstack([rises, falls]).tocsr()
 
 
-def _forms(problem: _Problem, smoothness: tuple[float, float]) -> np.ndarray:
-    """Quadratic form of the roughness of a map."""
-    by_angle, by_current = problem.fit.basis.roughness
-    return np.asarray(problem.scale * (smoothness[0] * by_angle + smoothness[1] * by_current
-                                       + 1e-12 * np.eye(problem.fit.basis.size)))
+def _forms(problem: _Problem, smoothness: tuple[float, float]) -> sparse.csr_matrix:
+    """Quadratic form of the roughness of a map, in all unknowns."""
+    by_angle, by_current = problem.fit.basis.roughness(problem.fit.stiffness)
+    of_map = problem.scale * (smoothness[0] * by_angle + smoothness[1] * by_current
+                              + 1e-12 * sparse.eye(problem.fit.basis.size))
+    return _widened(of_map, problem.design.shape[1])
+
+
+def _widened(of_map: sparse.spmatrix, size: int) -> sparse.csr_matrix:
+    """A quadratic form of the map, in all unknowns."""
+    wide = of_map.tocsr(copy=True)
+    wide.resize((size, size))
+    return wide
+
+
+def _solved(normal: sparse.spmatrix, right: np.ndarray, basis: FluxBasis) -> np.ndarray:
+    """The solution of the normal equations: of the map, whose functions reach over four angles, as a band, and of the
+    few other unknowns by what the map leaves of them. LinAlgError: they do not determine it."""
+    n, reach = basis.size, 4 * basis.columns
+    map_part = sparse.triu(normal[:n, :n]).tocoo()
+    band = np.zeros((reach, n))
+    np.add.at(band, (reach - 1 + map_part.row - map_part.col, map_part.col), map_part.data)
+    border, corner = normal[:n, n:].toarray(), normal[n:, n:].toarray()
+    factor = linalg.cholesky_banded(band, overwrite_ab=True, check_finite=False)
+    of_border = linalg.cho_solve_banded((factor, False), np.column_stack([border, right[:n]]), check_finite=False)
+    others = linalg.solve(corner - border.T @ of_border[:, :-1], right[n:] - border.T @ of_border[:, -1],
+                          assume_a="pos", check_finite=False)
+    return np.concatenate([of_border[:, -1] - of_border[:, :-1] @ others, others])
 
 
 def _weights(rows: Rows, fit: Fit, by_current: np.ndarray) -> np.ndarray:
@@ -283,30 +326,28 @@ def _solution(problem: _Problem, rows: Rows, phases: int, drawn: np.ndarray | No
     n = fit.basis.size
     weights = problem.weights if drawn is None else problem.weights * drawn
     weighted = design.multiply(weights[:, None]).tocsr()
-    normal, right = (weighted.T @ design).toarray() + np.diag(problem.ridge), weighted.T @ rows.flux_Wb + problem.pull
-    normal[:n, :n] += _forms(problem, fit.smoothness)
-    x = _constrained(problem, normal, right, n)
+    normal = weighted.T @ design + sparse.diags(problem.ridge) + _forms(problem, fit.smoothness)
+    x = _constrained(problem, normal.tocsr(), weighted.T @ rows.flux_Wb + problem.pull, n)
     more = np.zeros(2 * phases + 4) if problem.linear else x[n + 2:]
     return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
                fit.eccentricity_rad + more[phases:phases + 2], fit.delay_s + float(more[phases + 2]),
                fit.offset_A + more[phases + 3:-1], fit.conductance_S + float(more[-1]), rows.flux_Wb - design @ x,
-               fit.smoothness)
+               fit.smoothness, fit.stiffness)
 
 
-def _constrained(problem: _Problem, normal: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
+def _constrained(problem: _Problem, normal: sparse.csr_matrix, right: np.ndarray, n: int) -> np.ndarray:
     """The solution with the signs of a machine: others are drawn to their least value, with the
     rest of the map. IdentifyError: there is none."""
     signs, least = problem.signs, problem.least
-    weight = _SIGN_WEIGHT * float(np.trace(normal[:n, :n])) / float(signs.multiply(signs).sum())
+    weight = _SIGN_WEIGHT * float(normal.diagonal()[:n].sum()) / float(signs.multiply(signs).sum())
     active = np.zeros(signs.shape[0], bool)
     for _ in range(_SIGN_ROUNDS):
         held = signs[active]
-        of = normal.copy()
-        of[:n, :n] += weight * (held.T @ held).toarray()
+        of = normal + _widened(weight * (held.T @ held), normal.shape[0])
         more = right.copy()
         more[:n] += weight * (held.T @ least[active])
         try:
-            x = linalg.solve(of, more, assume_a="pos", check_finite=False)
+            x = _solved(of, more, problem.fit.basis)
         except linalg.LinAlgError:
             raise IdentifyError("the pulses do not determine the machine") from None
         violated = (signs @ x[:n] < least) & ~active

@@ -30,7 +30,9 @@ from salient.machine.scaling import scaling_of
 
 SAMPLES = 16
 _INTERVAL = 1.96
-MAP_ANGLES, MAP_CURRENTS = 61, 48
+MAP_ANGLES, MAP_CURRENTS = 97, 64
+"""Points of the map in the file: angles and currents of the loader's grid (salient.machine.flux_map), whose points are
+met exactly."""
 _REST_FLUX = 1e-6
 """Least rise between two points of a map, of its largest flux linkage."""
 _LEAST_SLOPE = 0.1
