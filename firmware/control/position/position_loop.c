@@ -174,7 +174,7 @@ COLD NOINLINE static void home(position_t *position, const position_command_t *c
 }
 
 /* a0 and q of the cubic from the reference to a position with a speed; false when it exceeds the limits. */
-COLD static bool begin_cubic(position_t *position, const position_command_t *command, int64_t to, int64_t speed) {
+COLD NOINLINE static bool begin_cubic(position_t *position, const position_command_t *command, int64_t to, int64_t speed) {
     const profile_limits_t *limits = &command->limits;
     const int64_t ticks = command->cycle.ticks;
     profile_state_t *from = &position->profile.start;

@@ -263,6 +263,7 @@ def _solved(normal: sparse.spmatrix, right: np.ndarray, basis: FluxBasis) -> np.
     few other unknowns by what the map leaves of them. LinAlgError: they do not determine it."""
     n, reach = basis.size, 4 * basis.columns
     map_part = sparse.triu(normal[:n, :n]).tocoo()
+    assert int((map_part.col - map_part.row).max()) < reach
     band = np.zeros((reach, n))
     np.add.at(band, (reach - 1 + map_part.row - map_part.col, map_part.col), map_part.data)
     border, corner = normal[:n, n:].toarray(), normal[n:, n:].toarray()
