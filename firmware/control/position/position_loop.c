@@ -173,8 +173,16 @@ COLD NOINLINE static void home(position_t *position, const position_command_t *c
     }
 }
 
+/* Place where a reference stops that passes a position with a speed. Not inlined, and apart from the cubic: their
+ * stacks do not add up. */
+COLD NOINLINE static int64_t stop_after(const profile_limits_t *limits, int64_t position, int64_t speed) {
+    const profile_state_t passing = {.x = position, .v = speed};
+    return profile_stop(limits, &passing);
+}
+
 /* a0 and q of the cubic from the reference to a position with a speed; false when it exceeds the limits. */
-COLD NOINLINE static bool begin_cubic(position_t *position, const position_command_t *command, int64_t to, int64_t speed) {
+COLD NOINLINE static bool begin_cubic(position_t *position, const position_command_t *command, int64_t to,
+                                      int64_t speed) {
     const profile_limits_t *limits = &command->limits;
     const int64_t ticks = command->cycle.ticks;
     profile_state_t *from = &position->profile.start;
@@ -188,11 +196,6 @@ COLD NOINLINE static bool begin_cubic(position_t *position, const position_comma
     const int64_t last = a + 6 * q * ticks;
     const int64_t most = limits->acceleration > limits->deceleration ? limits->acceleration : limits->deceleration;
     if (a > most || a < -most || last > most || last < -most || speed > limits->speed || speed < -limits->speed) {
-        return false;
-    }
-    const profile_state_t arrival = {.x = to, .v = speed, .a = 0};
-    const int64_t rest = profile_stop(limits, &arrival);
-    if (rest > command->highest || rest < command->lowest) {
         return false;
     }
     from->a = a & ~INT64_C(1);
@@ -223,9 +226,15 @@ COLD NOINLINE static void chase(position_t *position, const position_command_t *
     position->chases = position->targets > 2 && moves_on && possible;
     if (position->chases) {
         const int64_t ticks = (int64_t)command->cycle.ticks - AHEAD_TICKS;
-        const profile_state_t then = {.x = to - speed * ticks, .v = speed};
-        position->target = fixed_clamp_64(profile_stop(&command->limits, &then), command->lowest, command->highest);
+        const int64_t rest = stop_after(&command->limits, to - speed * ticks, speed);
+        position->target = fixed_clamp_64(rest, command->lowest, command->highest);
     }
+}
+
+static bool reaches(position_t *position, const position_command_t *command, int64_t to) {
+    const int64_t speed = speed_of_targets(position, &command->cycle, to);
+    const int64_t rest = stop_after(&command->limits, to, speed);
+    return rest <= command->highest && rest >= command->lowest && begin_cubic(position, command, to, speed);
 }
 
 COLD NOINLINE static void follow_targets(position_t *position, const position_command_t *command, bool begins) {
@@ -241,8 +250,7 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         position->cubic_ticks = 0;
         position->chases = false;
         go_to(position, command, to);
-        if (!position->status.limited &&
-            !begin_cubic(position, command, to, speed_of_targets(position, &command->cycle, to))) {
+        if (!position->status.limited && !reaches(position, command, to)) {
             chase(position, command, to);
         }
         position->past[1] = position->past[0];
