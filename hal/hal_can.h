@@ -24,8 +24,8 @@ bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame);
 /* Frames lost because the receive queue was full, since start. [background] */
 uint32_t hal_can_receive_overflows(const hal_t *hal);
 
-/* Puts a frame into a free mailbox; false when all are taken, in bus-off, and when one of its identifier waits that it
- * would overtake. The lowest identifier leaves first, frames of one identifier in their order. [background] */
+/* Puts a frame into a free mailbox; false when all are taken, or in bus-off. The lowest identifier leaves first.
+ * [background] */
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame);
 
 /* Error state (ISO 11898-1): passive above 127 of either counter, bus-off above 255 transmit errors. In bus-off nothing

@@ -94,18 +94,6 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
     return hal->receive_overflows;
 }
 
-/* Buffers of one identifier leave in the order of their numbers, not of their requests (RM0440, FDCAN: Tx queue): true
- * for a frame that would leave before one of its identifier that came first. */
-static bool overtakes(uint32_t index, uint32_t word0) {
-    const uint32_t pending = FDCAN_TXBRP;
-    for (uint32_t other = index + 1u; other < HAL_CAN_MAILBOXES; other++) {
-        if ((pending & BIT(other)) != 0 && ELEMENT(TRANSMIT_BUFFERS, other)[0] == word0) {
-            return true;
-        }
-    }
-    return false;
-}
-
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     (void)hal;
     const uint32_t status = FDCAN_TXFQS;
@@ -113,16 +101,12 @@ bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
         return false;
     }
     const uint32_t index = GET(FDCAN_TXFQS_TFQPI, status);
-    const uint32_t word0 = (frame->extended ? WORD0_EXTENDED | PUT(WORD0_EXTENDED_ID, frame->identifier)
-                                            : PUT(WORD0_STANDARD_ID, frame->identifier)) |
-                           (frame->remote ? WORD0_REMOTE : 0u);
-    if (overtakes(index, word0)) {
-        return false;
-    }
     volatile uint32_t *element = ELEMENT(TRANSMIT_BUFFERS, index);
     uint32_t data[2];
     (void)memcpy(data, frame->data, sizeof data);
-    element[0] = word0;
+    element[0] = (frame->extended ? WORD0_EXTENDED | PUT(WORD0_EXTENDED_ID, frame->identifier)
+                                  : PUT(WORD0_STANDARD_ID, frame->identifier)) |
+                 (frame->remote ? WORD0_REMOTE : 0u);
     element[1] = PUT(WORD1_LENGTH, frame->length);
     element[2] = data[0];
     element[3] = data[1];
