@@ -24,10 +24,10 @@ from scipy.optimize import nnls
 from salient.identify.basis import FluxBasis
 from salient.identify.link import OFF, ON, PART, ZERO, IdentifyError
 from salient.identify.sequence import Findings, Pulse
+from salient.machine.flux_map import ANGLE_INTERVALS
 
-ANGLES, CURRENTS = 96, 24
-"""Steps of the spline over half a rotor pitch, as many as the loader's (salient.machine.flux_map), and over the
-current."""
+ANGLES, CURRENTS = ANGLE_INTERVALS, 24
+"""Steps of the spline over half a rotor pitch, as many as the loader's, and over the current."""
 _ITERATIONS, _SMOOTHED = 5, 3
 """Iterations, and the one in which the smoothness is found: angles, delay and offsets are known then, whose errors
 would ask for a smoother map."""

@@ -26,13 +26,13 @@ from salient.identify.sequence import Findings
 from salient.identify.shaft import Shaft, shaft_of
 from salient.machine.contradictions import EDDY_TIME_CONSTANT_S
 from salient.machine.file import Machine, MachineError, load_machine
+from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
 from salient.machine.scaling import scaling_of
 
 SAMPLES = 16
 _INTERVAL = 1.96
-MAP_ANGLES, MAP_CURRENTS = 97, 64
-"""Points of the map in the file: angles and currents of the loader's grid (salient.machine.flux_map), whose points are
-met exactly."""
+MAP_ANGLES, MAP_CURRENTS = ANGLE_INTERVALS + 1, CURRENT_INTERVALS
+"""Points of the map in the file: angles and currents of the loader's grid, whose points are met exactly."""
 _REST_FLUX = 1e-6
 """Least rise between two points of a map, of its largest flux linkage."""
 _LEAST_SLOPE = 0.1
