@@ -8,7 +8,7 @@
 void canopen_send(canopen_t *canopen, const canopen_context_t *context, uint32_t identifier, const uint8_t *data,
                   unsigned length);
 
-/* Lets an emergency wait for canopen_send_emergencies; a fifth is lost. fault: of drive.dbc. */
+/* Lets an emergency wait for canopen_send_emergencies; the oldest of five is lost. fault: of drive.dbc. */
 void canopen_emergency(canopen_t *canopen, unsigned code, unsigned fault);
 
 /* Queues the oldest emergency that waits, when its inhibit time has passed. error_register: object 0x1001. */

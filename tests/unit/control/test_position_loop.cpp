@@ -56,15 +56,17 @@ class PositionLoop : public testing::Test {
         position_set_point_t set_point = {};
         set_point.order = kind;
         set_point.homing = homing;
-        set_point.sequence = command.set_point.sequence + 1;
-        set_point.target = int64_t(std::llround(target_rev * REV_32));
-        command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
+        send(set_point, target_rev);
     }
 
     void cyclic(double target_rev, uint32_t cycle_ms) {
         position_set_point_t set_point = {};
         set_point.order = POSITION_ORDER_CYCLIC;
         set_point.cycle_ms = cycle_ms;
+        send(set_point, target_rev);
+    }
+
+    void send(position_set_point_t set_point, double target_rev) {
         set_point.sequence = command.set_point.sequence + 1;
         set_point.target = int64_t(std::llround(target_rev * REV_32));
         command = position_command(&parameters, &set_point, 1 << 14, 1 << 14);
