@@ -24,8 +24,9 @@ bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame);
 /* Frames lost because the receive queue was full, since start. [background] */
 uint32_t hal_can_receive_overflows(const hal_t *hal);
 
-/* Puts a frame into a free mailbox; false when all are taken, or in bus-off. The lowest identifier leaves first.
- * [background] */
+/* Puts a frame into a free mailbox: the lowest identifier leaves first, and frames of one identifier in their order.
+ * Controllers send equal identifiers by number of the mailbox: the frame takes the lowest free one above every other of
+ * its identifier. False when there is none, or in bus-off. [background] */
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame);
 
 /* Error state (ISO 11898-1): passive above 127 of either counter, bus-off above 255 transmit errors. In bus-off nothing

@@ -75,6 +75,15 @@ bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *fra
     return true;
 }
 
+bool can_bus_transmit_from(can_bus_t *bus, unsigned drive, unsigned mailbox, const hal_can_frame_t *frame) {
+    can_node_t *node = &bus->drives[drive].node;
+    if (node->bus_off || !can_node_load(node, mailbox, frame)) {
+        return false;
+    }
+    request_start(bus, drive_line(bus, &bus->drives[drive]));
+    return true;
+}
+
 void can_bus_rejoin(can_bus_t *bus, unsigned drive, uint64_t now_ns) {
     can_node_rejoin(&bus->drives[drive].node, now_ns);
     request_start(bus, drive_line(bus, &bus->drives[drive]));
@@ -239,7 +248,7 @@ static void draw_fault(can_bus_t *bus, const can_node_t *node, can_mailbox_t *ma
     }
 }
 
-/* Mailbox that a node sends next, or NULL; *wake_ns becomes the time at which another one may, if that is earlier. */
+/* Mailbox that a node sends next, the first of equal ones, or NULL; *wake_ns becomes the time at which another one may, if that is earlier. */
 static can_mailbox_t *best_mailbox(can_bus_t *bus, can_node_t *node, uint64_t now_ns, uint64_t *wake_ns) {
     can_mailbox_t *best = NULL;
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
@@ -253,8 +262,7 @@ static can_mailbox_t *best_mailbox(can_bus_t *bus, can_node_t *node, uint64_t no
         const uint64_t not_before_ns = max_u64(mailbox->not_before_ns, node->suspended_till_ns);
         if (not_before_ns > now_ns) {
             *wake_ns = min_u64(*wake_ns, not_before_ns);
-        } else if (!best || mailbox->arbitration < best->arbitration ||
-                   (mailbox->arbitration == best->arbitration && mailbox->request < best->request)) {
+        } else if (!best || mailbox->arbitration < best->arbitration) {
             best = mailbox;
         }
     }

@@ -94,9 +94,12 @@ unsigned can_bus_add_drive(can_bus_t *bus);
 /* Frees the clients. */
 void can_bus_close(can_bus_t *bus);
 
-/* A drive puts a frame into a free mailbox; false when all three are taken, or in bus-off. A mailbox is free again when
- * its frame is complete. */
+/* A drive puts a frame into a mailbox, as hal_can_transmit() of hal_can.h; false when that refuses it. A mailbox is free
+ * again when its frame is complete. */
 bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *frame);
+
+/* A drive whose port chooses the mailbox (0..HAL_CAN_MAILBOXES - 1); false when it is taken, or in bus-off. */
+bool can_bus_transmit_from(can_bus_t *bus, unsigned drive, unsigned mailbox, const hal_can_frame_t *frame);
 
 /* Reset of a drive's controller at now_ns: error active, mailboxes empty. A frame that it transmits ends with an error;
  * one that another node transmits it does not receive. */

@@ -26,19 +26,27 @@ void can_node_close(can_node_t *node) {
     node->capacity = 0;
 }
 
-static void load(can_node_t *node, can_mailbox_t *mailbox, const hal_can_frame_t *frame) {
-    *mailbox = (can_mailbox_t){
-        .frame = *frame, .arbitration = can_node_arbitration(frame), .taken = true, .request = node->requests++};
+bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *frame) {
+    if (node->mailbox[mailbox].taken) {
+        return false;
+    }
+    node->mailbox[mailbox] =
+        (can_mailbox_t){.frame = *frame, .arbitration = can_node_arbitration(frame), .taken = true};
+    return true;
 }
 
 bool can_node_transmit(can_node_t *node, unsigned mailboxes, const hal_can_frame_t *frame) {
-    for (unsigned i = 0; i < mailboxes; ++i) {
-        if (!node->mailbox[i].taken) {
-            load(node, &node->mailbox[i], frame);
-            return true;
+    const uint32_t arbitration = can_node_arbitration(frame);
+    unsigned lowest = mailboxes;
+    for (unsigned i = mailboxes; i-- > 0;) {
+        const can_mailbox_t *mailbox = &node->mailbox[i];
+        if (!mailbox->taken) {
+            lowest = i;
+        } else if (mailbox->arbitration == arbitration) {
+            break;
         }
     }
-    return false;
+    return lowest < mailboxes && can_node_load(node, lowest, frame);
 }
 
 static size_t queued(const can_node_t *node) {
@@ -47,7 +55,7 @@ static size_t queued(const can_node_t *node) {
 
 static void refill(can_node_t *node) {
     if (!node->mailbox[0].taken && queued(node) > 0) {
-        load(node, &node->mailbox[0], &node->queue[node->popped++ % node->capacity]);
+        (void)can_node_load(node, 0, &node->queue[node->popped++ % node->capacity]);
     }
 }
 

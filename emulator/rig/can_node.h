@@ -20,7 +20,6 @@ typedef struct {
     bool taken;
     bool drawn; /* `fault` is this frame's */
     can_fault_t fault;
-    uint64_t request;       /* sequence number of the request */
     uint64_t not_before_ns; /* takes no part in arbitration earlier */
 } can_mailbox_t;
 
@@ -36,7 +35,6 @@ typedef struct {
     bool integrates;            /* after a reset: takes no part in the frame that is under way */
 
     can_mailbox_t mailbox[HAL_CAN_MAILBOXES];
-    uint64_t requests;
 
     /* Frames that wait for a mailbox. */
     hal_can_frame_t *queue;
@@ -53,7 +51,12 @@ void can_node_init(can_node_t *node);
 /* Frees the queue. */
 void can_node_close(can_node_t *node);
 
-/* Puts a frame into one of the first `mailboxes` mailboxes; false when all are taken. */
+/* Puts a frame into a mailbox; false when it is taken. Of frames with one arbitration field the one in the mailbox of
+ * lowest number is sent first. */
+bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *frame);
+
+/* Puts a frame into the lowest free one of the first `mailboxes` mailboxes in which it does not overtake a frame of its
+ * arbitration field; false when there is none. */
 bool can_node_transmit(can_node_t *node, unsigned mailboxes, const hal_can_frame_t *frame);
 
 /* Queues a frame; false when CAN_NODE_QUEUE_MAX frames wait or memory is exhausted. The queue sends in the order of

@@ -15,8 +15,6 @@
 
 static board_t *board;
 static wiring_t wiring;
-static can_mailbox_t *mailbox[3];
-static uint64_t mailbox_request[3];
 static uint32_t encoder_at; /* count whose levels the pins have */
 
 /* --- Analogue --- */
@@ -108,23 +106,12 @@ static void send(void *context, unsigned buffer, const fdcan_frame_t *frame) {
     hal_can_frame_t copy = {
         .identifier = frame->identifier, .extended = frame->extended, .remote = frame->remote, .length = frame->length};
     memcpy(copy.data, frame->data, sizeof copy.data);
-    can_node_t *node = &board->bus->drives[board->bus_drive].node;
-    mailbox[buffer] = NULL;
-    if (!board_can_transmit(board, &copy)) {
-        return; /* bus-off */
-    }
-    for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
-        can_mailbox_t *each = &node->mailbox[i];
-        if (each->taken && (!mailbox[buffer] || each->request > mailbox[buffer]->request)) {
-            mailbox[buffer] = each;
-        }
-    }
-    mailbox_request[buffer] = mailbox[buffer] ? mailbox[buffer]->request : 0;
+    (void)can_bus_transmit_from(board->bus, board->bus_drive, buffer, &copy); /* refused in bus-off alone */
 }
 
 static bool pending(void *context, unsigned buffer) {
     (void)context;
-    return mailbox[buffer] && mailbox[buffer]->taken && mailbox[buffer]->request == mailbox_request[buffer];
+    return board->bus->drives[board->bus_drive].node.mailbox[buffer].taken;
 }
 
 static void cancel(void *context, unsigned buffer) {
@@ -271,7 +258,6 @@ void bench_io_reset(void) {
     step(0);
     set(wiring.encoder_index, false);
     bench_io_lines();
-    memset(mailbox, 0, sizeof mailbox);
 }
 
 void bench_io_open(board_t *of, const wiring_t *pins) {

@@ -232,11 +232,12 @@ static uint32_t arbitration(unsigned buffer) {
                           : frame.identifier << 20 | (uint32_t)frame.remote;
 }
 
-/* The next of the requested buffers: of a queue the one that wins, of a FIFO the oldest. */
+/* The next of the requested buffers: of a queue the one that wins, by its number among equals, of a FIFO the oldest. */
 static uint8_t next_buffer(void) {
     uint8_t next = can.order[0];
     for (unsigned i = 1; REG(TXBC) >> 24 & 1 && i < can.requested; ++i) {
-        next = arbitration(can.order[i]) < arbitration(next) ? can.order[i] : next;
+        const uint32_t field = arbitration(can.order[i]), best = arbitration(next);
+        next = field < best || (field == best && can.order[i] < next) ? can.order[i] : next;
     }
     return next;
 }

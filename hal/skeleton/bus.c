@@ -16,7 +16,8 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
     return 0;
 }
 
-/* FILL IN: a free one of HAL_CAN_MAILBOXES transmit buffers; the lowest identifier leaves first. */
+/* FILL IN: a free one of HAL_CAN_MAILBOXES transmit buffers; the lowest identifier leaves first, equal ones in their
+ * order. */
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     (void)hal;
     (void)frame;

@@ -94,19 +94,36 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
     return hal->receive_overflows;
 }
 
+/* Lowest free buffer above every frame with this first word, HAL_CAN_MAILBOXES when there is none: buffers of one
+ * identifier leave in the order of their numbers, not of their requests (RM0440, FDCAN: Tx queue). */
+static uint32_t free_buffer(uint32_t word0) {
+    const uint32_t pending = FDCAN_TXBRP;
+    uint32_t lowest = HAL_CAN_MAILBOXES;
+    for (uint32_t index = HAL_CAN_MAILBOXES; index-- > 0;) {
+        if ((pending & BIT(index)) == 0) {
+            lowest = index;
+        } else if (ELEMENT(TRANSMIT_BUFFERS, index)[0] == word0) {
+            break;
+        } else {
+            /* another identifier: arbitration decides */
+        }
+    }
+    return lowest;
+}
+
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
     (void)hal;
-    const uint32_t status = FDCAN_TXFQS;
-    if ((FDCAN_PSR & FDCAN_PSR_BO) || (status & FDCAN_TXFQS_TFQF)) {
+    const uint32_t word0 = (frame->extended ? WORD0_EXTENDED | PUT(WORD0_EXTENDED_ID, frame->identifier)
+                                            : PUT(WORD0_STANDARD_ID, frame->identifier)) |
+                           (frame->remote ? WORD0_REMOTE : 0u);
+    const uint32_t index = free_buffer(word0);
+    if (index == HAL_CAN_MAILBOXES || (FDCAN_PSR & FDCAN_PSR_BO) != 0) {
         return false;
     }
-    const uint32_t index = GET(FDCAN_TXFQS_TFQPI, status);
     volatile uint32_t *element = ELEMENT(TRANSMIT_BUFFERS, index);
     uint32_t data[2];
     (void)memcpy(data, frame->data, sizeof data);
-    element[0] = (frame->extended ? WORD0_EXTENDED | PUT(WORD0_EXTENDED_ID, frame->identifier)
-                                  : PUT(WORD0_STANDARD_ID, frame->identifier)) |
-                 (frame->remote ? WORD0_REMOTE : 0u);
+    element[0] = word0;
     element[1] = PUT(WORD1_LENGTH, frame->length);
     element[2] = data[0];
     element[3] = data[1];

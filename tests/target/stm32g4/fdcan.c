@@ -67,5 +67,18 @@ int test(void) {
     REG(CAN + 0x18) = BIT(5) | BIT(7);
     wait(16 * 300);
     CHECK(!(REG(CAN + 0x44) & BIT(7)) && (REG(CAN + 0x90) & 15) == 0 && calls == 3);
+    /* A queue sends buffers of one identifier in the order of their numbers; the first leaves at once. */
+    REG(CAN + 0x18) |= 1;
+    REG(CAN + 0x18) |= 3;
+    REG(CAN + 0xC0) = BIT(24);
+    REG(CAN + 0x18) = BIT(5) | BIT(7);
+    for (unsigned buffer = 3; buffer-- > 0;) {
+        REG(BUFFER(buffer)) = 0x123u << 18;
+        REG(BUFFER(buffer) + 4) = 4u << 16;
+        REG(BUFFER(buffer) + 8) = buffer;
+        REG(CAN + 0xCC) = BIT(buffer);
+    }
+    wait(16 * 300);
+    CHECK(REG(FIFO0 + 8) == 2 && REG(FIFO0 + 72 + 8) == 0 && REG(FIFO0 + 144 + 8) == 1);
     return 0;
 }

@@ -227,20 +227,48 @@ TEST_F(CanBus, StartsAtTheEndOfTheInterframeSpaceWhenQueuedInIt) {
 }
 
 TEST_F(CanBus, LowestIdentifierOfTheMailboxesFirstAndEqualOnesInOrder) {
+    ASSERT_TRUE(transmit(frame(0x200)));
     ASSERT_TRUE(transmit(frame(0x300, {1})));
     ASSERT_TRUE(transmit(frame(0x300, {2})));
-    ASSERT_TRUE(transmit(frame(0x200)));
     EXPECT_FALSE(transmit(frame(0x100))) << "three mailboxes are taken";
     can_bus_start(&bus, 0);
     can_bus_delivery_t delivery;
     ASSERT_TRUE(can_bus_step(&bus, &delivery));
     EXPECT_EQ(delivery.frame.identifier, 0x200u);
-    ASSERT_TRUE(transmit(frame(0x300, {3}))) << "free again when its frame is complete";
+    EXPECT_FALSE(transmit(frame(0x300, {3}))) << "from mailbox 0 it would leave first";
+    ASSERT_TRUE(transmit(frame(0x300, {4}, true))) << "29 bits are another identifier";
     auto deliveries = run();
     ASSERT_EQ(deliveries.size(), 3u);
-    for (unsigned i = 0; i < 3; ++i) {
-        EXPECT_EQ(deliveries[i].second.frame.data[0], i + 1);
-    }
+    EXPECT_EQ(deliveries[0].second.frame.data[0], 4) << "which begins with zeros, and wins";
+    EXPECT_EQ(deliveries[1].second.frame.data[0], 1);
+    EXPECT_EQ(deliveries[2].second.frame.data[0], 2);
+    ASSERT_TRUE(transmit(frame(0x300, {3}))) << "free again when their frames are complete";
+}
+
+TEST_F(CanBus, FrameOfAnIdentifierTakesAFreeMailboxAboveTheOthers) {
+    ASSERT_TRUE(transmit(frame(0x100)));
+    ASSERT_TRUE(transmit(frame(0x300, {1})));
+    can_bus_start(&bus, 0);
+    can_bus_delivery_t delivery;
+    ASSERT_TRUE(can_bus_step(&bus, &delivery));
+    ASSERT_TRUE(transmit(frame(0x300, {2}))) << "the third, not the first";
+    ASSERT_TRUE(transmit(frame(0x200)));
+    auto deliveries = run();
+    ASSERT_EQ(deliveries.size(), 3u);
+    EXPECT_EQ(deliveries[1].second.frame.data[0], 1);
+    EXPECT_EQ(deliveries[2].second.frame.data[0], 2);
+}
+
+TEST_F(CanBus, PortThatChoosesItsMailboxMayLetAFrameOvertake) {
+    const hal_can_frame_t first = frame(0x300, {1}), second = frame(0x300, {2});
+    ASSERT_TRUE(can_bus_transmit_from(&bus, 0, 1, &first));
+    EXPECT_FALSE(can_bus_transmit_from(&bus, 0, 1, &second)) << "taken";
+    ASSERT_TRUE(can_bus_transmit_from(&bus, 0, 0, &second));
+    can_bus_start(&bus, 0);
+    auto deliveries = run();
+    ASSERT_EQ(deliveries.size(), 2u);
+    EXPECT_EQ(deliveries[0].second.frame.data[0], 2);
+    EXPECT_EQ(deliveries[1].second.frame.data[0], 1);
 }
 
 TEST_F(CanBus, ArbitrationFieldDecidesBetweenDriveAndClients) {

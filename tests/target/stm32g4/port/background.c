@@ -87,6 +87,16 @@ static void check_frames(hal_t *hal) {
     expect(hal, &three[0]);
     expect(hal, &three[2]);
     expect(hal, &three[1]);
+    /* Frames of one identifier keep their order, whichever mailbox is free. */
+    for (uint32_t number = 0; number < 12u;) {
+        const hal_can_frame_t next = frame_of(number, 0x155);
+        number += hal_can_transmit(hal, &next) ? 1u : 0u;
+    }
+    sent(hal);
+    for (uint32_t number = 0; number < 12u; number++) {
+        const hal_can_frame_t next = frame_of(number, 0x155);
+        expect(hal, &next);
+    }
 }
 
 static void put(hal_t *hal, uint32_t first, uint32_t count) {
