@@ -9,8 +9,8 @@
 /* Microseconds since start; wraps after 71 minutes. [any] */
 uint32_t hal_time_us(const hal_t *hal);
 
-/* The same by a second clock, the watchdog's, with an oscillator of its own and from any beginning. [background]
- */
+/* The same by a second clock with an oscillator of its own, from any beginning, in steps of at most 31 us (a crystal of
+ * 32,768 Hz). [background] */
 uint32_t hal_time_reference_us(const hal_t *hal);
 
 /* Masks the control interrupt and the deferred interrupt between the two calls; does not nest. [background] */

@@ -81,7 +81,8 @@ void board_stop_gates(board_t *board) {
 /* [SR-45] */
 void board_reset(board_t *board, hal_reset_cause_t cause) {
     board_pwm_open_all(board);
-    board->start_ns = board->time_ns;
+    board->start_ns = board->reference_from_ns = board->time_ns;
+    board->reference_at = 0.0;
     board->context = BOARD_START;
     board->in_critical_section = false;
     board->deferred_requested = false;
@@ -126,16 +127,21 @@ bool board_registers_intact(const board_t *board) {
     return board->period_ticks == board->period_written;
 }
 
-static double reference_us(const board_t *board) {
-    return board->reference_at_us + (double)(board->time_ns - board->reference_from_ns) * board->reference_rate * 1e-3;
+static double reference_cycles(const board_t *board) {
+    const double elapsed_ns = (double)(board->time_ns - board->reference_from_ns);
+    return board->reference_at + elapsed_ns * board->reference_rate * BOARD_REFERENCE_HZ / 1e9;
+}
+
+uint64_t board_reference_cycles(const board_t *board) {
+    return (uint64_t)reference_cycles(board);
 }
 
 uint32_t board_reference_us(const board_t *board) {
-    return (uint32_t)(uint64_t)reference_us(board);
+    return (uint32_t)(board_reference_cycles(board) * 1000000u / BOARD_REFERENCE_HZ);
 }
 
 void board_set_reference_rate(board_t *board, double rate) {
-    board->reference_at_us = reference_us(board);
+    board->reference_at = reference_cycles(board);
     board->reference_from_ns = board->time_ns;
     board->reference_rate = rate;
 }

@@ -19,6 +19,7 @@
 #include "rig/nvm.h"
 
 #define BOARD_STO_LINES 2
+#define BOARD_REFERENCE_HZ 32768u
 
 /* Context in which the firmware is called. */
 typedef enum { BOARD_START, BOARD_INTERRUPT, BOARD_DEFERRED, BOARD_BACKGROUND } board_context_t;
@@ -52,9 +53,10 @@ typedef struct {
     uint32_t received_pushed, received_popped; /* counts, not indices */
     uint32_t receive_overflows;
 
-    /* The second clock: its time at an instant and its rate from there on. */
+    /* The second clock, a crystal of BOARD_REFERENCE_HZ: its cycles since the drive's start up to an instant, and its
+     * rate from there on. */
     uint64_t reference_from_ns;
-    double reference_at_us, reference_rate;
+    double reference_at, reference_rate;
 
     uint64_t watchdog_ns; /* time at which the watchdog acts; UINT64_MAX: not started */
     hal_reset_cause_t reset_cause;
@@ -108,6 +110,8 @@ void board_can_status(const board_t *board, hal_can_status_t *status);
 void board_can_rejoin(board_t *board);
 void board_watchdog_kick(board_t *board);
 bool board_registers_intact(const board_t *board);
+/* Second clock: whole cycles since the drive's start, and the microseconds that they are. */
+uint64_t board_reference_cycles(const board_t *board);
 uint32_t board_reference_us(const board_t *board);
 
 /* For the rig: rate of the second clock from now on, >= 0; 1 is right. */

@@ -67,12 +67,7 @@ static void request_start(can_bus_t *bus, const can_line_t *line) {
 }
 
 bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *frame) {
-    can_node_t *node = &bus->drives[drive].node;
-    if (node->bus_off || !can_node_transmit(node, HAL_CAN_MAILBOXES, frame)) {
-        return false;
-    }
-    request_start(bus, drive_line(bus, &bus->drives[drive]));
-    return true;
+    return can_bus_transmit_from(bus, drive, can_node_free_mailbox(&bus->drives[drive].node, frame), frame);
 }
 
 bool can_bus_transmit_from(can_bus_t *bus, unsigned drive, unsigned mailbox, const hal_can_frame_t *frame) {
@@ -202,7 +197,7 @@ static void fill_babbler(can_bus_t *bus, uint64_t not_before_ns) {
         frame.data[i] = (uint8_t)(bus->babbled >> (8 * i));
     }
     ++bus->babbled;
-    can_node_transmit(&bus->babbler, 1, &frame);
+    (void)can_node_load(&bus->babbler, 0, &frame);
     mailbox->not_before_ns = not_before_ns;
 }
 
@@ -248,7 +243,7 @@ static void draw_fault(can_bus_t *bus, const can_node_t *node, can_mailbox_t *ma
     }
 }
 
-/* Mailbox that a node sends next, the first of equal ones, or NULL; *wake_ns becomes the time at which another one may, if that is earlier. */
+/* Mailbox that a node sends next, of equal ones the first, or NULL; *wake_ns: when another one may, if earlier. */
 static can_mailbox_t *best_mailbox(can_bus_t *bus, can_node_t *node, uint64_t now_ns, uint64_t *wake_ns) {
     can_mailbox_t *best = NULL;
     for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {

@@ -94,8 +94,8 @@ unsigned can_bus_add_drive(can_bus_t *bus);
 /* Frees the clients. */
 void can_bus_close(can_bus_t *bus);
 
-/* A drive puts a frame into a mailbox, as hal_can_transmit() of hal_can.h; false when that refuses it. A mailbox is free
- * again when its frame is complete. */
+/* A drive puts a frame into a mailbox, as hal_can_transmit() of hal_can.h; false when that refuses it. A mailbox is
+ * free again when its frame is complete. */
 bool can_bus_transmit(can_bus_t *bus, unsigned drive, const hal_can_frame_t *frame);
 
 /* A drive whose port chooses the mailbox (0..HAL_CAN_MAILBOXES - 1); false when it is taken, or in bus-off. */

@@ -27,7 +27,7 @@ void can_node_close(can_node_t *node) {
 }
 
 bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *frame) {
-    if (node->mailbox[mailbox].taken) {
+    if (mailbox >= HAL_CAN_MAILBOXES || node->mailbox[mailbox].taken) {
         return false;
     }
     node->mailbox[mailbox] =
@@ -35,10 +35,10 @@ bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *fr
     return true;
 }
 
-bool can_node_transmit(can_node_t *node, unsigned mailboxes, const hal_can_frame_t *frame) {
+unsigned can_node_free_mailbox(const can_node_t *node, const hal_can_frame_t *frame) {
     const uint32_t arbitration = can_node_arbitration(frame);
-    unsigned lowest = mailboxes;
-    for (unsigned i = mailboxes; i-- > 0;) {
+    unsigned lowest = HAL_CAN_MAILBOXES;
+    for (unsigned i = HAL_CAN_MAILBOXES; i-- > 0;) {
         const can_mailbox_t *mailbox = &node->mailbox[i];
         if (!mailbox->taken) {
             lowest = i;
@@ -46,7 +46,7 @@ bool can_node_transmit(can_node_t *node, unsigned mailboxes, const hal_can_frame
             break;
         }
     }
-    return lowest < mailboxes && can_node_load(node, lowest, frame);
+    return lowest;
 }
 
 static size_t queued(const can_node_t *node) {

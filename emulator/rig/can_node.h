@@ -51,13 +51,12 @@ void can_node_init(can_node_t *node);
 /* Frees the queue. */
 void can_node_close(can_node_t *node);
 
-/* Puts a frame into a mailbox; false when it is taken. Of frames with one arbitration field the one in the mailbox of
- * lowest number is sent first. */
-bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *frame);
+/* Number of the lowest free mailbox in which a frame does not overtake one of its arbitration field;
+ * HAL_CAN_MAILBOXES when there is none. Of these frames the one in the mailbox of lowest number is sent first. */
+unsigned can_node_free_mailbox(const can_node_t *node, const hal_can_frame_t *frame);
 
-/* Puts a frame into the lowest free one of the first `mailboxes` mailboxes in which it does not overtake a frame of its
- * arbitration field; false when there is none. */
-bool can_node_transmit(can_node_t *node, unsigned mailboxes, const hal_can_frame_t *frame);
+/* Puts a frame into a mailbox; false when it is taken, or does not exist. */
+bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *frame);
 
 /* Queues a frame; false when CAN_NODE_QUEUE_MAX frames wait or memory is exhausted. The queue sends in the order of
  * arrival, through one mailbox. */

@@ -28,9 +28,8 @@ static struct {
     uint64_t start_cycle, origin_ns; /* the same instant in both times */
 } bench;
 
-/* The start takes no time on the host: both counters of the time stand until the bench begins. */
-static void hold_clocks(bool held) {
-    apart_hold_lse(held);
+/* The start takes no time on the host: the time stands until the bench begins, as the bench's second clock does. */
+static void hold_time(bool held) {
     for (unsigned i = 0; i < TIMERS; ++i) {
         if (timers[i].runs && timers[i].arr == UINT32_MAX && timers[i].psc > 0) {
             timers[i].held = held;
@@ -52,9 +51,9 @@ static void outputs_changed(void *context) {
         bench.origin_ns = board->time_ns;
         soc.untimed = true;
         cpu_stall(soc.now); /* nor does the rest of this block of instructions take time */
-        hold_clocks(false);
+        hold_time(false);
     } else if (!bench.started) {
-        hold_clocks(true);
+        hold_time(true);
     }
 }
 
@@ -109,7 +108,6 @@ static void control_interrupt(void *context) {
     (void)context;
     const uint64_t now = cycle_of(board->time_ns);
     soc_advance(now - 1);
-    apart_set_lse_ratio(board->reference_rate);
     bench_io_encoder();
     bench_io_lines();
     fdcan_refresh();

@@ -154,7 +154,7 @@ static void room(void *context) {
     bench_io_receive();
 }
 
-/* --- Memory, random numbers --- */
+/* --- Memory, random numbers, second clock --- */
 
 static uint64_t memory_read(void *context, unsigned word, bool *torn) {
     (void)context;
@@ -178,6 +178,11 @@ static void memory_erase(void *context, unsigned page) {
 static uint32_t random_number(void *context) {
     (void)context;
     return board_random(board);
+}
+
+static uint64_t second_clock(void *context) {
+    (void)context;
+    return board_reference_cycles(board);
 }
 
 /* --- Gates --- */
@@ -274,5 +279,6 @@ void bench_io_open(board_t *of, const wiring_t *pins) {
     flash_set_store(&(flash_store_t){.read = memory_read, .program = memory_program, .erase = memory_erase},
                     MEMORY_FIRST_PAGE, HAL_NVM_PAGES);
     apart_set_random(random_number, NULL);
+    apart_set_lse(second_clock, NULL);
     bench_io_reset();
 }

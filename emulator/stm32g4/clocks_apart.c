@@ -37,13 +37,15 @@ static struct {
     bool runs, unlocked;
     uint32_t reload; /* of the last refresh */
     uint64_t expires_ns;
-    bool counts, held; /* held: the counter stands */
-    double counts_from_ns, at_start, ratio;
+    bool counts;
+    uint64_t counts_from; /* cycles of its clock at its start */
+    apart_lse_t lse;
+    void *lse_context;
     apart_random_t random;
     void *random_context;
     uint64_t state;
     uint64_t number_ready_ns; /* RNG_DR has the next number */
-} apart = {.ratio = 1.0};
+} apart;
 
 /* --- Independent watchdog --- */
 
@@ -91,26 +93,22 @@ static void iwdg_write(uint32_t address, uint32_t value) {
 
 /* --- Low-power timer: the counter alone --- */
 
-static double lptim_hz(void) {
-    const uint32_t hz = rcc_lptim1_hz() >> (REG(LPTIM_CFGR) >> 9 & 7);
-    return hz * apart.ratio;
+/* Cycles of the timer's clock; LSE is the board's crystal, where a bench has one. */
+static uint64_t lptim_cycles(void) {
+    if (rcc_lptim1_has_lse() && apart.lse) {
+        return apart.lse(apart.lse_context);
+    }
+    return (uint64_t)((double)soc_ns(soc.now) * rcc_lptim1_hz() / NS_PER_S);
 }
 
-static double lptim_ticks(void) {
-    const double elapsed_ns = (double)soc_ns(soc.now) - apart.counts_from_ns;
-    return apart.at_start + (apart.counts && !apart.held ? elapsed_ns * lptim_hz() / NS_PER_S : 0.0);
+static uint64_t lptim_count(void) {
+    const unsigned prescaler = REG(LPTIM_CFGR) >> 9 & 7;
+    return apart.counts ? (lptim_cycles() - apart.counts_from) >> prescaler : 0;
 }
 
-void apart_set_lse_ratio(double ratio) {
-    apart.at_start = lptim_ticks();
-    apart.counts_from_ns = (double)soc_ns(soc.now);
-    apart.ratio = ratio;
-}
-
-void apart_hold_lse(bool held) {
-    apart.at_start = lptim_ticks();
-    apart.counts_from_ns = (double)soc_ns(soc.now);
-    apart.held = held;
+void apart_set_lse(apart_lse_t lse, void *context) {
+    apart.lse = lse;
+    apart.lse_context = context;
 }
 
 static bool random_ready(void) {
@@ -124,7 +122,7 @@ static void next_random(void) {
 static uint32_t apart_read(uint32_t address) {
     switch (address) {
     case LPTIM_CNT:
-        return (uint32_t)((uint64_t)lptim_ticks() % ((uint64_t)REG(LPTIM_ARR) + 1));
+        return (uint32_t)(lptim_count() % ((uint64_t)REG(LPTIM_ARR) + 1));
     case RNG_SR:
         if (REG(RNG_CR) & RNGEN && !rcc_hsi48_ready()) {
             soc_violation("read of RNG_SR: its 48 MHz clock does not run (RCC_CRRCR, RCC_CCIPR.CLK48SEL)");
@@ -169,12 +167,10 @@ static void lptim_write(uint32_t address, uint32_t value) {
                 soc_violation("write of LPTIM1_CR, value 0x%X: its clock does not run (RCC_CCIPR.LPTIM1SEL)", value);
             }
             apart.counts = true;
-            apart.at_start = 0.0;
-            apart.counts_from_ns = (double)soc_ns(soc.now);
+            apart.counts_from = lptim_cycles();
         }
         if (!(value & LPTIM_ENABLE)) {
             apart.counts = false;
-            apart.at_start = 0.0;
         }
         value &= LPTIM_ENABLE;
         break;
@@ -215,5 +211,4 @@ void apart_attach(void) {
 
 void apart_reset(void) {
     apart.runs = apart.unlocked = apart.counts = false;
-    apart.at_start = 0.0;
 }

@@ -21,6 +21,7 @@ void rcc_reset(uint32_t cause);
 bool rcc_lsi_runs(void);
 void rcc_run_lsi(void); /* the independent watchdog starts it */
 uint32_t rcc_lptim1_hz(void);
+bool rcc_lptim1_has_lse(void);
 uint32_t rcc_fdcan_hz(void);
 uint32_t rcc_adc_hz(bool converters_345); /* of the kernel's clock before the prescaler, 0: off */
 bool rcc_hsi48_ready(void);
@@ -113,7 +114,7 @@ void apart_watchdog_event(void);
 uint64_t apart_watchdog_expires_ns(void); /* SOC_NEVER: it does not run */
 typedef uint32_t (*apart_random_t)(void *context);
 void apart_set_random(apart_random_t random, void *context);
-void apart_set_lse_ratio(double ratio); /* 1: exact */
-void apart_hold_lse(bool held);         /* its counter stands */
+typedef uint64_t (*apart_lse_t)(void *context); /* cycles of the crystal since any instant */
+void apart_set_lse(apart_lse_t lse, void *context);
 
 #endif

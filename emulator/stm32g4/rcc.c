@@ -182,6 +182,10 @@ uint32_t rcc_lptim1_hz(void) {
     }
 }
 
+bool rcc_lptim1_has_lse(void) {
+    return (REG(CCIPR) >> 18 & 3) == 3;
+}
+
 uint32_t rcc_adc_hz(bool converters_345) {
     const uint32_t select = REG(CCIPR) >> (converters_345 ? 30 : 28) & 3;
     return select == 1 ? pll_p_hz() : select == 2 ? sysclk_hz() : 0;
