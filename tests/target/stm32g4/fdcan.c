@@ -78,7 +78,8 @@ int test(void) {
         REG(BUFFER(buffer) + 8) = buffer;
         REG(CAN + 0xCC) = BIT(buffer);
     }
+    CHECK(REG(CAN + 0xC4) == BIT(21)); /* full */
     wait(16 * 300);
-    CHECK(REG(FIFO0 + 8) == 2 && REG(FIFO0 + 72 + 8) == 0 && REG(FIFO0 + 144 + 8) == 1);
+    CHECK(REG(CAN + 0xC4) == 0 && REG(FIFO0 + 8) == 2 && REG(FIFO0 + 72 + 8) == 0 && REG(FIFO0 + 144 + 8) == 1);
     return 0;
 }

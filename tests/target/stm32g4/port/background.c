@@ -87,12 +87,15 @@ static void check_frames(hal_t *hal) {
     expect(hal, &three[0]);
     expect(hal, &three[2]);
     expect(hal, &three[1]);
-    /* Frames of one identifier keep their order, whichever mailbox is free. */
+    /* Frames of one identifier keep their order, whichever mailbox is free: the first one is. */
+    frame = frame_of(0, 0x154);
+    CHECK(hal_can_transmit(hal, &frame));
     for (uint32_t number = 0; number < 12u;) {
         const hal_can_frame_t next = frame_of(number, 0x155);
         number += hal_can_transmit(hal, &next) ? 1u : 0u;
     }
     sent(hal);
+    expect(hal, &frame);
     for (uint32_t number = 0; number < 12u; number++) {
         const hal_can_frame_t next = frame_of(number, 0x155);
         expect(hal, &next);
