@@ -50,7 +50,7 @@ def dask_cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 @pytest.fixture
 def unreadable(browser: Browser) -> Callable[[Path, int], list[str]]:
-    """Parts that nobody can read of a page at a width: text that is cut off, or the numbers of a table that its first
+    """Parts of a page that cannot be read at a width: text that is cut off, or the numbers of a table that its first
     column, which stays when the table is scrolled, covers."""
 
     def find(path: Path, width: int) -> list[str]:

@@ -21,7 +21,7 @@ from salient.bus.signals import SignalTable, drive_database, signal_range, value
 from salient.config import either
 from salient.dbc import FIRST_PHASES, PHASES, phases_above
 from salient.errors import RunFailed, close_names
-from salient.machine.parameter_table import CHOICES, value_name
+from salient.machine.parameter_table import CHOICES, read_table, value_name
 
 _COMMAND = drive_database().get_message_by_name("DRIVE_COMMAND")
 _TORQUE_COMMAND = drive_database().get_message_by_name("DRIVE_TORQUE_COMMAND")
@@ -34,8 +34,8 @@ assert _COMMAND.cycle_time is not None  # GenMsgCycleTime in drive.dbc
 COMMAND_PERIOD_NS = _COMMAND.cycle_time * 1_000_000
 """Period of the commands in virtual time; the drive stops when they are no longer sent."""
 
-_CYCLE_MAX_NS = 20_000_000
-"""Longest position_cycle_ms. A cyclic position that is repeated is another target: it is repeated when the next one has
+_CYCLE_MAX_NS = 1_000_000 * next(row.maximum for row in read_table() if row.name == "position_cycle_ms")
+"""The longest cycle. A cyclic position that is repeated is another target: it is repeated when the next one has
 not come after half a cycle more."""
 
 _DISARMED_NS = 2_000_000

@@ -53,7 +53,7 @@ _BINS, _REPEATS = 36, 2
 
 
 def plate_of(path: Path, folder: Path) -> Path:
-    """A name plate: poles, converter, ratings and full scales of a machine, and a motor that nobody has measured."""
+    """A name plate: poles, converter, ratings and full scales of a machine, and a motor that has not been measured."""
     machine = load_machine(path)
     data = scaling_of(path, machine).data
     table = tomllib.loads(path.read_text(encoding="utf-8-sig"))

@@ -1,1 +1,1 @@
-"""Identification: a drive measures its own motor, whose flux linkages nobody knows."""
+"""Identification: a drive measures its own motor, whose flux linkages are not known."""
