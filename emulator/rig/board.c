@@ -4,6 +4,8 @@
 
 #include "plant/random.h"
 
+#define PHASES_OF_A_BOARD 4u
+
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned bus_drive, uint64_t seed) {
     memset(board, 0, sizeof *board);
     board->adc_bits = sensors->adc_bits;
@@ -84,6 +86,7 @@ void board_reset(board_t *board, hal_reset_cause_t cause) {
     board->start_ns = board->reference_from_ns = board->time_ns;
     board->reference_at = 0.0;
     board->context = BOARD_START;
+    board_convert_temperatures(board);
     board->in_critical_section = false;
     board->deferred_requested = false;
     board->period_ticks = 0;
@@ -98,6 +101,31 @@ void board_reset(board_t *board, hal_reset_cause_t cause) {
     nvm_power_on(&board->nvm);
 }
 
+/* Windings, then switches, of a board for four phases where these suffice. */
+static unsigned board_phases(const board_t *board) {
+    return board->plant->machine->phases > PHASES_OF_A_BOARD ? HAL_PHASES_MAX : PHASES_OF_A_BOARD;
+}
+
+static unsigned temperature_sensor(const board_t *board) {
+    const unsigned phases = board_phases(board), number = board->temperature_number;
+    return number < phases ? HAL_ADC_WINDING + number : HAL_ADC_INVERTER + number - phases;
+}
+
+static void start_temperature(board_t *board, unsigned number) {
+    board->temperature_number = number % (2 * board_phases(board));
+    board->temperature_sample = board->temperature_input[temperature_sensor(board)];
+}
+
+static void convert_temperature(board_t *board) {
+    board->temperature_code[temperature_sensor(board)] = board->temperature_sample;
+    start_temperature(board, board->temperature_number + 1);
+}
+
+void board_convert_temperatures(board_t *board) {
+    memcpy(board->temperature_code, board->temperature_input, sizeof board->temperature_code);
+    start_temperature(board, 0);
+}
+
 void board_start_period(board_t *board, bool busy) {
     hal_encoder_sample_t encoder;
     sensors_sample_encoder(board->sensors, board->plant, &encoder);
@@ -106,6 +134,7 @@ void board_start_period(board_t *board, bool busy) {
     } else {
         sensors_sample_adc(board->sensors, board->plant, &board->adc);
         board->encoder = encoder;
+        convert_temperature(board);
         board->active = board->buffered;
     }
     drive_gates(board, busy);

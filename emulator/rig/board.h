@@ -35,7 +35,11 @@ typedef struct {
     hal_encoder_sample_t encoder; /* likewise */
     unsigned adc_bits;            /* 12..16 */
     unsigned encoder_bits;        /* 8..32 */
-    uint16_t temperature_code[HAL_ADC_TEMPERATURES];
+    /* Temperature sensors: the codes at their inputs, and the last converted ones. Each control interrupt starts the
+     * conversion of one, and the next has its code, as in hal/stm32g4. */
+    uint16_t temperature_input[HAL_ADC_TEMPERATURES], temperature_code[HAL_ADC_TEMPERATURES];
+    unsigned temperature_number; /* of the sensor in conversion, in the order of the board */
+    uint16_t temperature_sample; /* its code */
 
     uint16_t period_ticks;   /* register of the timer; 0 until it is started */
     uint16_t period_written; /* to it */
@@ -77,7 +81,7 @@ typedef struct {
 void board_init(board_t *board, plant_t *plant, sensors_t *sensors, can_bus_t *bus, unsigned bus_drive, uint64_t seed);
 
 /* For the rig: a reset of the drive, or power that returns. Timer and watchdog stopped, switches open, what was
- * received is lost; frames in the transmit mailboxes still leave. */
+ * received is lost, temperatures converted. */
 void board_reset(board_t *board, hal_reset_cause_t cause);
 
 /* For the rig: the watchdog of a firmware that cannot be reset opens the switches, as a break does. */
@@ -87,6 +91,9 @@ void board_stop_gates(board_t *board);
  * values. While the interrupt is still running (`busy`), the trigger is missed and counted, and the values that the
  * interrupt reads are unchanged. */
 void board_start_period(board_t *board, bool busy);
+
+/* For the rig: converts all temperatures, as a port does before the drive starts. */
+void board_convert_temperatures(board_t *board);
 
 /* For the rig: energises a line of safe torque off, or not, at the time of the plant; without both every switch is
  * open. line < BOARD_STO_LINES. */

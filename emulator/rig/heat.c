@@ -10,9 +10,6 @@
 /* Change of a winding's temperature that its resistance follows. */
 #define FOLLOWED_K 1.0
 #define STEP_NS UINT64_C(1000000)
-/* The firmware reads the sensors in whole milliseconds from the same begin: a reading that is some control periods old,
- * as of a board that converts one sensor in each, is then the same as one without age. */
-#define FIRST_STEP_NS (STEP_NS / 2)
 #define CODES 65536.0
 #define CODE_12_BITS 0xFFF0u
 
@@ -76,7 +73,7 @@ static void follow_resistances(heat_t *heat) {
 
 void heat_step(heat_t *heat) {
     const plant_t *plant = heat->plant;
-    if (plant->time_ns - heat->time_ns < (heat->time_ns == 0 ? FIRST_STEP_NS : STEP_NS)) {
+    if (plant->time_ns - heat->time_ns < STEP_NS) {
         return;
     }
     const double step_s = (double)(plant->time_ns - heat->time_ns) * S_PER_NS;

@@ -4,10 +4,9 @@
  *
  *   C dT / dt = P - (T - T_ambient) / R        C, R: thermal_data_t, of the machine file
  *
- * in explicit steps of a millisecond, the first of half one, and at most a control period more, whose energies are
- * exact. A body may be held at a temperature instead. The resistance of a winding in the plant follows its temperature
- * when that has changed by 1 K, which is 0.4 % of the resistance: a run that heats its windings by less has a constant
- * resistance.
+ * in explicit steps of a millisecond and at most a control period more, whose energies are exact. A body may be held at
+ * a temperature instead. The resistance of a winding in the plant follows its temperature when that has changed by 1 K,
+ * which is 0.4 % of the resistance: a run that heats its windings by less has a constant resistance.
  *
  * A sensor has the temperature of its body at the end of the step, and the line of hal_adc.h at 12 bits.
  */
@@ -30,7 +29,7 @@ typedef struct {
 
 typedef struct {
     plant_t *plant;
-    uint16_t *codes;  /* of the sensors, where the board has them */
+    uint16_t *codes;  /* of the sensors, at the inputs of the board */
     uint64_t time_ns; /* of the last step */
     double ambient_C;
     heat_bodies_t winding, inverter;

@@ -80,7 +80,8 @@ static void init(rig_t *rig, rig_t *first, unsigned bus_drive, const rig_config_
     load_init(&rig->load, &rig->plant, &rig->scheduler);
     supply_init(&rig->supply, &rig->plant, &rig->scheduler);
     dynamometer_init(&rig->dynamometer, &rig->plant, &rig->scheduler);
-    heat_init(&rig->heat, &rig->plant, rig->board.temperature_code);
+    heat_init(&rig->heat, &rig->plant, rig->board.temperature_input);
+    board_convert_temperatures(&rig->board);
     control_period_init(&rig->control_period, &(control_period_t){.plant = &rig->plant,
                                                                   .sensors = &rig->sensors,
                                                                   .board = &rig->board,

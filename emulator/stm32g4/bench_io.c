@@ -25,10 +25,10 @@ static uint16_t code_at(int pin) {
             return board->adc.phase_current_counts[phase];
         }
         if (pin == wiring.winding[phase]) {
-            return board->temperature_code[HAL_ADC_WINDING + phase] >> (16 - CONVERTER_BITS);
+            return board->temperature_input[HAL_ADC_WINDING + phase] >> (16 - CONVERTER_BITS);
         }
         if (pin == wiring.switches[phase]) {
-            return board->temperature_code[HAL_ADC_INVERTER + phase] >> (16 - CONVERTER_BITS);
+            return board->temperature_input[HAL_ADC_INVERTER + phase] >> (16 - CONVERTER_BITS);
         }
     }
     return pin == wiring.dc_link  ? board->adc.bus_voltage_counts
