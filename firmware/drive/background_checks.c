@@ -240,7 +240,7 @@ COLD static bool is_lost_phase_intact(const drive_t *drive) {
 }
 
 /* A latch that has changed is not to be trusted: the drive is in fault from here on, and of a run that this has ended
- * nothing is left. [SR-51] */
+ * nothing is left. Once: what stays changed is no new fault in each call, which the log would take for many. [SR-51] */
 COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
     self_test_t *test = &drive->self_test;
     state_machine_t *state_machine = &drive->control.state_machine;
@@ -250,14 +250,28 @@ COLD static void test_itself(drive_t *drive, hal_t *hal, uint32_t time_us) {
                         misalignment_is_intact(&drive->control_parameters.misalignment,
                                                &drive->control.deferred.misalignment, machine_tables.phases);
     hal_critical_enter(hal);
-    if (!intact || !self_test_latch_intact(&drive->control) || !is_lost_phase_intact(drive)) {
+    const bool latched = self_test_latch_intact(&drive->control);
+    if (!intact || !latched || !is_lost_phase_intact(drive)) {
         test->failed |= SELF_TEST_FAULT_LATCH;
+    }
+    if (!latched || ((test->failed & SELF_TEST_FAULT_LATCH) != 0 && state_machine->state != DRIVE_STATE_FAULT)) {
         drive->control.torque_reference_q24 = 0;
         control_prepare(&drive->control_parameters, &drive->control);
         state_machine_start_in_fault(state_machine, FAULT_BIT(FAULT_MEMORY));
         state_machine->record.time_us = time_us;
     }
     hal_critical_leave(hal);
+}
+
+/* Heat as a part of another continuous current; torque of the shaft by another inertia; torque that is left without a
+ * phase. [SR-16] [SR-31] */
+COLD void background_checks_reconfigure(drive_t *drive, const control_parameters_t *coming) {
+    const control_parameters_t *present = &drive->control_parameters;
+    thermal_reconfigure(&present->thermal, &coming->thermal, &drive->thermal);
+    if (coming->observer.acceleration_q32 != present->observer.acceleration_q32) {
+        drive->shaft_torque = (shaft_torque_t){0};
+    }
+    drive->degraded = (degraded_t){.lost = drive->degraded.lost, .least_q24 = INT32_MAX};
 }
 
 /* With one phase lost the drive may go on: then what has failed is no fault any more. Until the fault is cleared

@@ -10,4 +10,8 @@
  * one. [background] */
 void background_checks(drive_t *drive, hal_t *hal, uint32_t time_us);
 
+/* Forgets what has been found beside parameters that now change, and is no more than that with them: before they take
+ * effect. coming: those that follow the ones in effect, outside of a run. [background] */
+void background_checks_reconfigure(drive_t *drive, const control_parameters_t *coming);
+
 #endif

@@ -35,6 +35,9 @@ COLD static void configure(drive_t *drive, hal_t *hal) {
                           hal_adc_bits(hal), hal_pwm_clock_hz(hal));
     control_parameters.thermal = thermal_configure(drive->parameters.values);
     control_parameters.temperature = temperature_configure(drive->parameters.values);
+    if (may_configure(drive)) {
+        background_checks_reconfigure(drive, &control_parameters);
+    }
     hal_critical_enter(hal);
     if (may_configure(drive)) {
         drive->control_parameters = control_parameters;
@@ -247,11 +250,17 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
             }
         }
         hal_critical_enter(hal);
+        if (drive->control.state_machine.identifies && command->request != COMMAND_IDENTIFY) {
+            drive->comms.command.request = COMMAND_OFF; /* the laws take no run over that is not theirs */
+        }
         drive->command = *command;
         if (positions) { /* long: the interrupts of the other modes do not wait for it */
             drive->control.position_command = position;
         }
         drive->identify.command = drive->comms.commands.identify;
+        if (drive->identify.command.phase + 1u == drive->control.lost_phase) { /* whose switches stay open */
+            drive->identify.command.kind = IDENTIFY_KIND_REST;
+        }
         hal_critical_leave(hal);
         drive->ramping = false;
     }
@@ -392,7 +401,9 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
     if (commanded) {
         take_command(drive, hal);
     }
-    if (drive->identify.state == IDENTIFY_ENDED && drive->command.request == COMMAND_IDENTIFY) {
+    /* An end that the run before has left does not count. */
+    if (drive->identify.begun && drive->identify.state == IDENTIFY_ENDED &&
+        drive->command.request == COMMAND_IDENTIFY) {
         withdraw_command(drive, hal);
     }
     watchdog_monitor_pass(&drive->watchdog, WATCHDOG_SERVED);

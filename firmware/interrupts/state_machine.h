@@ -9,7 +9,8 @@
  * over: a request that persists clears neither a later fault nor one whose cause disappears later. In RUN it is refused
  * (comms/commands.h): a drive that finds both has got there without a request to run, and leaves it.
  *
- * COMMAND_IDENTIFY, from READY on, is a run without the control laws: `identifies`. Every other request ends it.
+ * COMMAND_IDENTIFY, from READY on, is a run without the control laws: `identifies`. Every other request ends it, as
+ * COMMAND_OFF, which is all that drive.c lets through then.
  *
  * The states are independent of the direction of rotation. RUN passes through zero speed when the reference changes its
  * sign. A stop remains in RUN with a reference that ramps to zero, from either side, until the rotor is at standstill:

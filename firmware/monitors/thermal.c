@@ -7,6 +7,7 @@
 #include "storage/fault.h"
 
 #define US_PER_S INT64_C(1000000)
+#define LOAD_MAX_Q24 (INT64_C(0x1000000) * THERMAL_SQUARE_MAX - 1)
 #define SQUARE_MAX_Q16 ((uint64_t)THERMAL_SQUARE_MAX << 16)
 
 COLD static thermal_model_t model(int32_t current_q9, int32_t time_constant_s) {
@@ -23,6 +24,20 @@ COLD thermal_parameters_t thermal_configure(const int32_t *values) {
         .switches = model(values[PARAMETER_SWITCH_CURRENT_A], THERMAL_SWITCH_TIME_CONSTANT_S),
         .torque_max_q24 = values[PARAMETER_TORQUE_MAX_NM],
     };
+}
+
+/* Loads in Q24, below 2^30, times at most 2^30. */
+COLD static void refer(const thermal_model_t *before, const thermal_model_t *now, int64_t *load_q56) {
+    const bool differs = before->inverse_q48 != 0 && before->inverse_q48 != now->inverse_q48;
+    for (unsigned phase = 0; differs && phase < HAL_PHASES_MAX; phase++) {
+        const int64_t load_q24 = fixed_divide((load_q56[phase] >> 32) * now->inverse_q48, before->inverse_q48);
+        load_q56[phase] = fixed_clamp_64(load_q24, 0, LOAD_MAX_Q24) * INT64_C(0x100000000);
+    }
+}
+
+COLD void thermal_reconfigure(const thermal_parameters_t *before, const thermal_parameters_t *now, thermal_t *thermal) {
+    refer(&before->winding, &now->winding, thermal->winding_q56);
+    refer(&before->switches, &now->switches, thermal->switches_q56);
 }
 
 /* rate * step is at most 2^29 * 2^17, and the difference less than 2^23. */

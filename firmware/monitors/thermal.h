@@ -58,6 +58,9 @@ typedef struct {
 /* Derives the parameters: any values within the limits of the table. */
 thermal_parameters_t thermal_configure(const int32_t *values);
 
+/* The same heat beside other continuous currents. `before`: all zero when there are none yet. [background] */
+void thermal_reconfigure(const thermal_parameters_t *before, const thermal_parameters_t *now, thermal_t *thermal);
+
 /* Samples the currents, in A, Q7.9, 0..2^16-1, and moves the models when a step is over. True in a call that has moved
  * them. [background] */
 bool thermal_sample(const thermal_parameters_t *parameters, thermal_t *thermal, const int32_t *current_q9,

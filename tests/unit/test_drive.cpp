@@ -730,6 +730,57 @@ TEST_F(Drive, notes_of_the_lost_phase_that_do_not_agree_are_the_fault_memory) {
     }
 }
 
+// The log has sixteen faults, and a page of the memory some thousand erasures. [SR-51] [SR-60]
+TEST_F(Drive, memory_that_stays_changed_is_one_fault_at_the_time_of_its_first_check) {
+    const std::function<void()> changes[] = {
+        [this] { drive.control.lost_phase = 2; },
+        [this] { drive.comms.command.request = COMMAND_OFF; },
+        [this] { drive.control.deferred.misalignment.phase[1].offset = INT32_MIN; },
+    };
+    for (const auto &change : changes) {
+        hal.nvm = hal_t::erased();
+        SetUp();
+        counter = 0;
+        std::fill_n(hal.adc.phase_current_counts, 3, uint16_t(0));
+        std::fill(std::begin(flux_Wb), std::end(flux_Wb), 0.0);
+        periods(100);
+        command(COMMAND_RUN);
+        periods(20);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        change();
+        periods(2);
+        ASSERT_EQ(drive.control.state_machine.record.fault, FAULT_MEMORY);
+        const uint32_t time_us = drive.control.state_machine.record.time_us;
+        const uint32_t generation = drive.control.deferred_request.generation;
+        periods(800);
+        EXPECT_EQ(drive.control.state_machine.record.time_us, time_us);
+        EXPECT_LE(drive.control.deferred_request.generation, generation + 1);
+        EXPECT_EQ(nvm_store_newest_fault(&drive.store), 1u);
+        EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
+    }
+}
+
+// [SR-51]
+TEST_F(Drive, memory_that_changes_in_a_fault_leaves_its_record_and_keeps_it_from_being_cleared) {
+    hal.break_causes = hal.break_lasts = HAL_PWM_BREAK_OVER_CURRENT;
+    periods(100);
+    hal.break_lasts = 0;
+    hal.break_causes = 0;
+    periods(100);
+    ASSERT_EQ(drive.control.state_machine.record.fault, FAULT_NONE) << "not before ready";
+    hal.break_causes = HAL_PWM_BREAK_OVER_CURRENT;
+    periods(2);
+    ASSERT_EQ(drive.control.state_machine.record.fault, FAULT_HARDWARE_OVER_CURRENT);
+    drive.control.lost_phase = 2;
+    periods(2);
+    EXPECT_EQ(drive.control.state_machine.record.fault, FAULT_HARDWARE_OVER_CURRENT);
+    EXPECT_EQ(drive.self_test.failed, SELF_TEST_FAULT_LATCH);
+    periods(600);
+    send(COMMAND_CLEAR_FAULT);
+    periods(600);
+    EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+}
+
 // [SR-51]
 TEST_F(Drive, a_state_that_is_none_is_the_fault_memory) {
     periods(100);
@@ -972,6 +1023,69 @@ TEST_F(Drive, an_experiment_drives_its_phase_and_is_over_with_its_limit_or_witho
     EXPECT_TRUE(hal.open);
 }
 
+// Whatever comes instead of an experiment begins after its end: with a rotor that turns, a stop too, and a run in the
+// same period as that. [SR-39]
+TEST_F(Drive, an_experiment_on_a_rotor_that_turns_is_over_with_any_other_request) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    for (const std::vector<command_request_t> &requests : std::vector<std::vector<command_request_t>>{
+             {COMMAND_OFF}, {COMMAND_STOP}, {COMMAND_STOP, COMMAND_RUN}, {COMMAND_STOP, COMMAND_STOP}}) {
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        counter = 0;
+        hal.encoder_counts = 1000;
+        periods(100);
+        hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_REST, 0));
+        arm_for_run(7);
+        periods(8);
+        ASSERT_TRUE(drive.control.state_machine.identifies);
+        for (int k = 0; k < 400; k++) { // to 300 r/min
+            hal.encoder_counts += k % 16 < k / 25 ? 1 : 0;
+            periods(1);
+        }
+        ASSERT_GT(drive.control.observer.speed_q22, 1 << 22);
+        for (const command_request_t request : requests) {
+            send(request);
+            drive_background(&drive, &hal); // no interrupt between them
+        }
+        hal.time_us += 25;
+        drive_control_interrupt(&drive, &hal);
+        deferred_interrupt(&drive, &hal);
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY) << requests.size() << requests[0];
+        EXPECT_FALSE(drive.control.state_machine.identifies);
+        EXPECT_TRUE(hal.open);
+        periods(40);
+        EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY) << "the end of a run disarms";
+        EXPECT_EQ(drive.self_test.failed, 0u);
+    }
+}
+
+// [SR-31]
+TEST_F(Drive, an_experiment_closes_no_switch_of_a_lost_phase) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+    periods(100);
+    drive.degraded.lost = 2u;
+    drive.control.lost_phase = 2u;
+    uint8_t number = 0;
+    for (const uint8_t phase : {1, 2, 1}) {
+        for (const unsigned kind : {IDENTIFY_KIND_PULSE, IDENTIFY_KIND_HOLD}) {
+            hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, kind, phase, ++number));
+            if (number == 1) {
+                arm_for_run(7);
+                periods(2);
+                hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, kind, phase, ++number));
+            }
+            bool closed = false;
+            for (int k = 0; k < 80; k++) {
+                periods(1);
+                closed = closed || hal.written.upper[phase] + hal.written.lower[phase] > 0;
+            }
+            ASSERT_TRUE(drive.control.state_machine.identifies);
+            EXPECT_EQ(closed, phase == 2) << int(phase) << kind;
+        }
+    }
+}
+
 TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
     const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
     ASSERT_TRUE(drive_init(&drive, &hal, &config)); // experiments are the controller salient's
@@ -986,6 +1100,25 @@ TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
     EXPECT_EQ(drive.command.request, COMMAND_OFF);
     EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
     EXPECT_TRUE(hal.open);
+}
+
+TEST_F(Drive, an_experiment_begins_after_a_run_that_a_limit_has_ended) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    for (const uint8_t arming_counter : {7, 17}) {
+        hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_REST, 1));
+        arm_for_run(arming_counter);
+        periods(4);
+        ASSERT_TRUE(drive.control.state_machine.identifies) << int(arming_counter);
+        EXPECT_EQ(drive.identify.limit, IDENTIFY_WITHIN);
+        drive.identify.run_periods = IDENTIFY_TIME_MS * 40u + 1u;
+        periods(4);
+        EXPECT_EQ(drive.identify.limit, IDENTIFY_TIME);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+        EXPECT_EQ(drive.command.request, COMMAND_OFF);
+        periods(400);
+    }
 }
 
 // Torque that would carry the speed beyond the last reference ends at once; towards it, and in torque mode, it ramps.
@@ -1502,6 +1635,66 @@ TEST_F(Drive, a_written_parameter_acts_in_the_interrupt_and_not_while_it_runs) {
     EXPECT_EQ(drive.control.torque_reference_q24, 5 << 24);
     EXPECT_EQ(write(PARAMETER_TORQUE_MAX_NM, 6 << 24), DRIVE_PARAMETER_RESPONSE_STATUS_NOT_WHILE_RUNNING_CHOICE);
     EXPECT_EQ(drive.control_parameters.torque_mode.torque_max_q24, 5 << 24);
+}
+
+// [SR-16]
+TEST_F(Drive, heat_stays_what_it_is_and_is_another_part_of_another_continuous_current) {
+    periods(100);
+    const int32_t before_q9 = drive.parameters.values[PARAMETER_WINDING_CURRENT_A];
+    for (const int32_t divisor : {3, 1}) {
+        drive.thermal.winding_q56[1] = int64_t(1) << 53; // 1/8
+        drive.thermal.switches_q56[1] = int64_t(1) << 53;
+        const int32_t present_q9 = drive.parameters.values[PARAMETER_WINDING_CURRENT_A];
+        ASSERT_EQ(write(PARAMETER_WINDING_CURRENT_A, before_q9 / divisor), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
+        const double ratio = double(present_q9) / (before_q9 / divisor);
+        EXPECT_NEAR(thermal_winding_load_q16(&drive.thermal) / 65536.0, ratio * ratio / 8.0, 2e-3);
+        EXPECT_NEAR(thermal_switch_load_q16(&drive.thermal) / 65536.0, 1.0 / 8.0, 2e-3);
+        periods(100);
+        EXPECT_EQ(drive.control.state_machine.record.fault, divisor == 3 ? FAULT_WINDING_OVERLOAD : FAULT_NONE);
+        drive.thermal.winding_q56[1] = 0;
+        periods(100);
+        send(COMMAND_CLEAR_FAULT);
+        periods(600);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+    }
+}
+
+// [SR-31]
+TEST_F(Drive, the_torque_without_a_phase_is_found_anew_with_other_parameters) {
+    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+    drive.degraded.lost = 2u;
+    drive.control.lost_phase = 2u;
+    periods(400);
+    const int32_t most_q24 = drive.degraded.most_q24, mean_q24 = drive.degraded.mean_q24;
+    ASSERT_GT(mean_q24, 0);
+    const int32_t limit_q9 = drive.parameters.values[PARAMETER_CURRENT_LIMIT_A];
+    ASSERT_EQ(write(PARAMETER_CURRENT_LIMIT_A, limit_q9 / 2), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
+    periods(400);
+    EXPECT_EQ(drive.degraded.lost, 2u);
+    EXPECT_GT(drive.degraded.mean_q24, 0);
+    EXPECT_LT(drive.degraded.mean_q24, mean_q24 / 4 * 3);
+    EXPECT_LT(drive.control.torque_limit_q24, most_q24 / 4 * 3);
+}
+
+TEST_F(Drive, another_inertia_forgets_what_the_shaft_has_shown_by_the_one_before_and_no_other_parameter_does) {
+    periods(100);
+    const int32_t inertia_q30 = drive.parameters.values[PARAMETER_INERTIA_KG_M2];
+    const int32_t band_q24 = drive.parameters.values[PARAMETER_TORQUE_BAND_INNER_NM];
+    const std::pair<unsigned, int32_t> sets[] = {{PARAMETER_TORQUE_BAND_INNER_NM, band_q24 / 2},
+                                                 {PARAMETER_INERTIA_KG_M2, inertia_q30 / 20 * 19}};
+    for (const auto &[index, value] : sets) {
+        drive.shaft_torque = {.variance = INT64_C(1) << 40, .covariance = INT64_C(19) << 35, .factor_q30 = 31 << 25};
+        ASSERT_EQ(write(index, value), DRIVE_PARAMETER_RESPONSE_STATUS_DONE_CHOICE);
+        drive.table_scale.smooth_q30 = 1 << 30;
+        drive.table_scale.smooth_complement = ~drive.table_scale.smooth_q30;
+        command(COMMAND_RUN);
+        run(0.05);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        const double excess = drive.control.table_scale.excess_q31 / 0x1p31, followed = 1.0 - std::exp(-0.05 / 0.2);
+        EXPECT_NEAR(excess, index == PARAMETER_INERTIA_KG_M2 ? 0.0 : -followed / 32.0, 0.001) << index;
+        send(COMMAND_OFF);
+        periods(4);
+    }
 }
 
 // [SR-56]
