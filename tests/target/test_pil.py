@@ -97,9 +97,9 @@ def test_fault_of_the_drive_is_exit_code_1(tmp_path, capsys):
 
 @pytest.mark.parametrize(("line", "message"), [
     ([], "one of the arguments SCENARIO.toml --bound --figures is required"),
-    (["--bound", "--figures"], "--figures not allowed with argument --bound"),
-    (["--bound", "salient", "--figures"], "--figures not allowed with argument --bound"),
-    (["a.toml", "--figures"], "--figures not allowed with argument SCENARIO.toml"),
+    (["--bound", "--figures"], "--figures: not allowed with --bound"),
+    (["--bound", "salient", "--figures"], "--figures: not allowed with --bound"),
+    (["a.toml", "--figures"], "--figures: not allowed with SCENARIO.toml"),
 ])
 def test_exactly_one_task_is_required_before_anything_is_installed(line, message, capsys):
     with pytest.raises(SystemExit, match="2"):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fresh_clones import all_commands, documented
 
+from salient import paths
 from salient.paths import BUILD, ROOT
 from salient.test_runner import _test_preset
 
@@ -118,6 +121,22 @@ def test_folder_of_a_clone_that_is_gone_is_taken_over(checkout: Path, tmp_path: 
     done = launch(PREPARED, checkout, "machine", "saturating", build=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "clone").read_bytes() == os.fsencode(checkout)
+
+
+def test_command_tells_that_it_waits_for_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                 capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(paths, "BUILD", tmp_path)
+    monkeypatch.setattr(paths, "_LOCK_TOLD_S", 0.1)
+    with paths.build_lock():
+        assert capsys.readouterr().err == ""
+    with (tmp_path / "launcher.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        waiting = threading.Timer(1.0, fcntl.flock, (other, fcntl.LOCK_UN))
+        waiting.start()
+        with paths.build_lock():
+            waiting.join()
+    assert capsys.readouterr().err == (
+        f"salient: waiting for another command, which installs or builds in {tmp_path}\n")
 
 
 def test_what_pytest_leaves_goes_there(pytestconfig: pytest.Config) -> None:

@@ -234,7 +234,8 @@ def test_progress_is_one_line_per_step_without_a_terminal():
     assert stream.getvalue() == "1/2 one\n2/2 two\n"
 
 
-def test_progress_uses_one_line_of_a_terminal_and_clears_it():
+def test_progress_uses_one_line_of_a_terminal_and_clears_it(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
     stream = Terminal()
     with Progress(2, stream) as progress:
         progress.step("one")

@@ -91,6 +91,8 @@ def test_invalid_command_line_is_rejected(salient, arguments, expected_texts):
         (SCENARIO.replace('["paper"]', '["paper", "paper"]'), ["controllers", "different"]),
         (SCENARIO.replace("saturating", "nonesuch"), ["nonesuch", "the nearest of 10 are "]),
         (SCENARIO.replace('machine = "saturating"', ""), ["machine", "missing"]),
+        (SCENARIO + "load_profile = 5\n", ["load_profile: 5: must be a text"]),
+        (SCENARIO + '[parameters]\n"" = 1\n', ["parameters.'': unknown parameter; the nearest of "]),
         (SCENARIO + "seed = 1.5\n", ["seed", "1.5", "whole number"]),
         (SCENARIO + "control_rate_hz = 30000\n", ["control_rate_hz", "30000", "20000, 40000, 50000, 100000"]),
         (SCENARIO + "[[speed]]\nat_s = 0\nvalue = 600\n", ["speed.value", "unknown key", "value_rpm"]),
@@ -178,6 +180,37 @@ def machine_file(folder: Path, name: str, old: str, new: str) -> Path:
 def test_invalid_machine_file_is_rejected(salient_without_build, tmp_path, old, new, expected_texts):
     path = machine_file(tmp_path, "mine", old, new)
     assert_usage_error(salient_without_build("sim", "--machine", path), str(path), *expected_texts)
+
+
+@pytest.mark.parametrize("option", ["--json", "--a2l", "--eds", "--dbc"])
+def test_machine_file_that_is_read_stays(salient_without_build, tmp_path, option):
+    path = machine_file(tmp_path, "mine", "", "")
+    text = path.read_text()
+    assert_usage_error(salient_without_build("machine", path, option, "./mine.toml"), option, "would be overwritten")
+    assert path.read_text() == text
+    assert_usage_error(salient_without_build("tab", "--machine", path, "--out", path), "--out", "would be overwritten")
+    assert path.read_text() == text
+
+
+def test_import_writes_nothing_outside_its_folder(salient_without_build, tmp_path):
+    """A name is a part of paths before the machine file that has it is checked."""
+    path = machine_file(tmp_path, "mine", "", "")
+    path.write_text(path.read_text().replace('name = "mine"', 'name = "../mine"'))
+    shutil.copy(MACHINES / "finite_element.csv", tmp_path / "table.csv")
+    before = {each: each.read_bytes() for each in tmp_path.iterdir()}
+    assert_usage_error(salient_without_build("machine", path, "--import", "table.csv", "--out", "imported"), str(path),
+                       "name: '../mine': must be a word of letters, digits and underscores")
+    assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
+
+
+def test_path_of_a_bus_that_is_too_long_is_told(salient_without_build):
+    assert_usage_error(salient_without_build("monitor", "--can", f"unix:{200 * 'x'}"),
+                       "no drive answers there (AF_UNIX path too long)")
+
+
+def test_baseline_that_is_too_deep_is_told(salient_without_build, tmp_path):
+    (tmp_path / "compare.json").write_text(100_000 * "[")
+    assert_usage_error(salient_without_build("compare", "--baseline", "compare.json"), "compare.json: not JSON")
 
 
 def test_bus_in_use_is_reported(salient, make_bench):

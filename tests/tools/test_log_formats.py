@@ -216,6 +216,23 @@ def test_contradictory_options_are_one_line(salient_without_build, tmp_path, opt
     assert all(word in result.stderr for word in words), result.stderr
 
 
+@pytest.mark.parametrize(("source", "options"), [
+    ("a.log", ["--out", "a.log"]), ("a.log", ["--out", "link.log"]), ("a.log", ["--out", "same.log"]),
+    ("can_0001.log", ["--out", "can.log", "--rotate", "1kB"]), ("can_0002.log", ["--out", "can.log", "--rotate", "1s"]),
+])
+def test_log_that_is_converted_stays_whatever_name_it_has(salient_without_build, tmp_path, source, options):
+    text = "(0.000001) can0 123#11\n" * 5000
+    (tmp_path / source).write_text(text)
+    (tmp_path / "link.log").symlink_to(source)
+    (tmp_path / "same.log").hardlink_to(tmp_path / source)
+    result = salient_without_build("log", "--convert", source, *options)
+    assert (result.stdout, result.returncode) == ("", 2)
+    assert result.stderr == (f"salient: --out {options[1]}: {source} is read, and would be overwritten; name another "
+                             "file\n")
+    assert (tmp_path / source).read_text() == text
+    assert {path.name for path in tmp_path.iterdir()} == {source, "link.log", "same.log"}
+
+
 def test_suffix_of_no_format_and_two_sources_are_refused(capsys):
     for options, words in ((["--out", "b.txt"], ["b.txt", ".asc, .mf4, .csv, .parquet, .blf or .log"]),
                            (["--convert", "a.log", "--can", "unix:x"], ["--can", "not allowed with", "--convert"])):

@@ -258,9 +258,12 @@ def databases_of(path):
 @pytest.mark.parametrize(
     ("files", "line"),
     [
-        ({"a.dbc": None}, "--dbc a.dbc: No such file or directory"),
+        ({"a.dbc": None}, "--dbc a.dbc: no such file"),
         ({"a.dbc": "hello"}, "--dbc a.dbc: no valid DBC: Invalid syntax at line 1, column 1: \">>!<<hello\""),
         ({"a.dbc": "\0\1\2"}, "--dbc a.dbc: no valid DBC: "),
+        ({"a.dbc": 'VERSION ""\nBO_ 300 M: 99999999 A\n'},
+         "--dbc a.dbc: no valid DBC: M has 99999999 bytes, at most 100000"),
+        ({"/dev/zero": None}, "--dbc /dev/zero: not a file"),
         ({"a.dbc": 'VERSION ""\nBU_: A\n'}, "--dbc a.dbc: no valid DBC: it defines no message"),
         ({"a.dbc": 'VERSION ""\nBO_ 1 M: 1 A\n\nBO_ 1 N: 1 A\n'},
          "--dbc a.dbc: no valid DBC: M has the identifier 001 of another message of the file"),
@@ -327,6 +330,21 @@ def test_what_no_frame_carries_is_left_out_with_a_line(decoded):
     assert sorted(said.splitlines()) == [
         "salient: --dbc a.dbc: LONG has 200 bytes, a frame at most 64, and is left out",
         "salient: --dbc a.dbc: M.y is beyond the 8 bytes of the message and is left out"]
+
+
+@pytest.mark.parametrize(("kind", "value", "shown"), [
+    ("STRING", '"often"', "'often'"), ("INT -9 9", "-5", "-5"), ("FLOAT 0 9", "1e400", "inf")])
+def test_cycle_time_that_is_none_is_left_out_with_a_line(salient_without_build, tmp_path, kind, value, shown):
+    (tmp_path / "a.dbc").write_text(DBC.format(' SG_ x : 0|8@1+ (1,0) [0|0] "" A\n')
+                                    + f'BA_DEF_ BO_ "GenMsgCycleTime" {kind};\nBA_DEF_DEF_ "GenMsgCycleTime" '
+                                    f'{value};\nBA_ "GenMsgCycleTime" BO_ 300 {value};\n')
+    write_logs([(number * 1_000_000, can.Message(arbitration_id=300, is_extended_id=False, data=bytes(8)))
+                for number in range(3)], tmp_path / "can.blf")
+    done = salient_without_build("monitor", "--replay", "can.blf", "--dbc", "a.dbc")
+    assert (done.returncode, done.stderr) == (
+        0, f"salient: --dbc a.dbc: M has the cycle time {shown}, which is left out; it is a number of ms from 0 to "
+        "1000000000\n")
+    assert re.search(r"12C M +3 frames  cycle +1.000 ms, 1.000 to 1.000 ms$", done.stdout, re.MULTILINE), done.stdout
 
 
 def test_frames_that_are_too_short_are_counted(decoded):

@@ -9,10 +9,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
 from salient import __main__ as salient_main
+from salient.bench.parameter_file import save
+from salient.errors import UsageError
 from salient.paths import ROOT
 
 SALIENT = (sys.executable, "-m", "salient")
@@ -79,6 +83,68 @@ def test_output_without_a_reader_is_no_failure(tmp_path: Path, arguments: tuple[
     done = subprocess.run([*SALIENT, *arguments], cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_stream_becomes_the_null_device(tmp_path: Path, closed: str) -> None:
+    """Else the next file or socket that is opened has its number, and gets what is printed; for programs that the
+    command starts, too."""
+    code = ("import os, sys; from salient.errors import exit_code\n"
+            "def command():\n"
+            "    print('to nobody'); print('to nobody', file=sys.stderr)\n"
+            "    of = [os.path.realpath(f'/proc/self/fd/{n}') for n in range(3) if os.get_inheritable(n)]\n"
+            "    with open('found', 'w') as file:\n"
+            "        file.write(' '.join(of))\n"
+            "    return 3\n"
+            "sys.exit(exit_code(command))")
+    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, code], cwd=tmp_path,
+                          capture_output=True, text=True)
+    assert done.returncode == 3
+    assert "to nobody" not in (done.stdout if ">&-" in closed.split() else done.stderr if "2>&-" in closed else "")
+    found = (tmp_path / "found").read_text().split()
+    assert len(found) == 3
+    for number, sign in enumerate(("<&-", ">&-", "2>&-")):
+        assert sign not in closed.split() or found[number] == os.devnull
+
+
+def test_message_does_not_go_to_the_output_where_there_are_no_errors(tmp_path: Path) -> None:
+    done = subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *SALIENT, "run", "nonesuch"], cwd=tmp_path,
+                          capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
+
+
+@pytest.mark.parametrize("build", ["", "relative", "/tmp/absolute"])
+def test_working_folder_that_is_gone_is_no_traceback(tmp_path: Path, build: str) -> None:
+    code = ("import os, sys; os.rmdir(os.getcwd()); from salient.errors import exit_code; "
+            "from salient.cli import make_parser; sys.argv[1:] = ['sim', '--pace', 'x']; "
+            "sys.exit(exit_code(lambda: make_parser().parse_args() and 0))")
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True,
+                          env={**os.environ, "SALIENT_BUILD": build})
+    assert done.returncode == 2
+    assert_one_line(done.stderr, "--pace x")
+
+
+def test_parameters_that_cannot_be_saved_leave_the_file(full_disk: Path) -> None:
+    class Parameters(dict):
+        rows: ClassVar[dict] = {}
+
+    path = full_disk / "mine.toml"
+    path.write_text("# of yesterday\n")
+    (full_disk / "link.toml").symlink_to(path)
+    session = SimpleNamespace(drive=SimpleNamespace(parameters=Parameters()))
+    save(session, full_disk / "link.toml")
+    assert (path.read_text(), (full_disk / "link.toml").is_symlink()) == ("# parameters of a drive\n", True)
+    path.write_text("# of yesterday\n")
+    with pytest.raises(OSError, match="No space"):
+        (full_disk / "rest").write_bytes(bytes(64 * 1024))
+    with pytest.raises(UsageError, match="No space left on device"):
+        save(session, path)
+    assert path.read_text() == "# of yesterday\n"
+    assert {each.name for each in full_disk.iterdir()} == {"filler", "rest", "mine.toml", "link.toml"}
+    save(session, Path("/dev/null"))
+    assert Path("/dev/null").is_char_device()
 
 
 @pytest.mark.parametrize(("error", "code", "line"), [

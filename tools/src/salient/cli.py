@@ -37,14 +37,22 @@ BOARD_CLOCKS = ("170", "100")
 BOARD_ENCODERS = ("absolute", "index")
 _SHOWN_OUT, _SHOWN_BUILD = (text.replace("%", "%%") for text in (str(OUT), from_root(BUILD)))
 """For argparse, which formats a text of help."""
+_SECONDS_MAX = 1e9
+"""A time in seconds is at most 31 years: 64 bits of nanoseconds, and the clocks of the system, can have it."""
 CHANGE_PERCENT = 10.0
 """Smaller changes of a ripple, which is an extreme of one run, are within its scatter."""
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        # By itself argparse takes -1e3, -1,2 and -inf for options, which then lack their value or are not known.
+        self._negative_number_matcher = re.compile(r"-(\.?\d|inf|nan)", re.ASCII | re.IGNORECASE)
+
     def error(self, message: str) -> NoReturn:
         """One line and exit code 2."""
-        message = re.sub(r"^argument ([^:]*): expected one argument$", r"\1: requires a value", message)
+        message = re.sub(r"^argument ([^:]*): expected (?:at least )?one argument$", r"\1: requires a value", message)
+        message = re.sub(r"^argument ([^:]*): not allowed with argument ", r"\1: not allowed with ", message)
         message = re.sub(r"^argument ([^:]*): ", r"\1 ", message)
         print(f"salient: {' '.join(message.splitlines())} ({self.prog} --help)", file=sys.stderr)
         sys.exit(2)
@@ -521,8 +529,8 @@ def _percent(text: str) -> float:
 
 def _positive(text: str) -> float:
     value = _number(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0")
+    if not 0.0 < value <= _SECONDS_MAX:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0 and at most {_SECONDS_MAX:.0f}")
     return value
 
 

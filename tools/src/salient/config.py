@@ -109,7 +109,7 @@ class Option:
             number = int(text)
             if number in self.choices if self.choices else self.minimum <= number <= self.maximum:
                 return number
-        elif self.kind == NUMBER and re.fullmatch(r"[-+0-9.eE]+", text):
+        elif self.kind == NUMBER and re.fullmatch(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?", text):
             value = float(text)
             if self.minimum <= value <= self.maximum:
                 return value

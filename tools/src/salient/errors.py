@@ -76,6 +76,7 @@ def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: No
     files end with it (salient.guard). out: the value of --out, which stands for the
     file of a write that failed.
     """
+    _open_streams()
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by the launcher while modules are loaded
         with guarded():
@@ -102,6 +103,19 @@ def exit_code(command: Callable[[], int], out: Callable[[], object] = lambda: No
         is_connection = isinstance(error, ConnectionError | TimeoutError) or not is_file
         _discard_output()  # what could not be written is not tried again at the end of the process
         return _end(text if where is None else f"{where}: {text}", 1 if is_connection else 2)
+
+
+def _open_streams() -> None:
+    """Gives standard streams that the caller has closed (`>&-`) the null device, for this process and what it executes:
+    else the next file or socket that is opened gets their number, and what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            null = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+            os.set_inheritable(null, True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
 
 
 def _end(line: str, code: int) -> int:

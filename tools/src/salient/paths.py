@@ -4,8 +4,10 @@ folder data/ has the files that are needed in the places that they have in the r
 import contextlib
 import fcntl
 import os
+import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -16,6 +18,8 @@ _DATA = Path(__file__).resolve().parent / "data"
 IS_WHEEL = _DATA.is_dir()
 ROOT = _DATA if IS_WHEEL else _DATA.parents[3]
 BUILD_VARIABLE = "SALIENT_BUILD"
+_LOCK_TOLD_S = 5.0
+_LOCK_LOOK_S = 0.02
 
 
 def _build_folder() -> Path:
@@ -25,7 +29,9 @@ def _build_folder() -> Path:
     if not given:
         return ROOT / "build"
     # Processes that this one starts in another folder mean the same one.
-    folder = Path(os.path.normpath(Path.cwd() / given))
+    folder = Path(given)
+    with contextlib.suppress(FileNotFoundError):  # the present folder has been removed: told when this one is made
+        folder = Path(os.path.abspath(given))  # noqa: PTH100 - without .., which Path keeps
     os.environ[BUILD_VARIABLE] = str(folder)
     return folder
 
@@ -73,7 +79,7 @@ def _open_lock() -> TextIO:
         try:
             BUILD.mkdir(parents=True, exist_ok=True)
             lock = stack.enter_context((BUILD / "launcher.lock").open("w"))
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            _wait_for(lock)
             note = BUILD / "clone"
             owner = Path(os.fsdecode(note.read_bytes())) if note.exists() else ROOT
             if BUILD != ROOT / "build" and owner != ROOT and (owner / "tools").is_dir():
@@ -89,6 +95,20 @@ def _open_lock() -> TextIO:
         return lock
 
 
+def _wait_for(lock: TextIO) -> None:
+    """Takes a lock; tells in a line that another command has it when that takes longer than a build that is up to
+    date."""
+    told_s = time.monotonic() + _LOCK_TOLD_S
+    while time.monotonic() < told_s:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        time.sleep(_LOCK_LOOK_S)
+    print(f"salient: waiting for another command, which installs or builds in {from_root(BUILD)}", file=sys.stderr,
+          flush=True)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+
+
 def keep_text(path: Path, text: str) -> None:
     """Writes a file that others may write and read at the same time, where it does not have this text yet: a process
     sees a whole file or none."""
@@ -98,7 +118,12 @@ def keep_text(path: Path, text: str) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file and its folder: another process sees the whole file or none, whatever ends this one. OSError."""
+    """Writes a file and its folder: another process sees the whole file or none, whatever ends this one. OSError; then
+    a file that was there is as it was."""
+    if path.exists() and not path.is_file():  # a device or a pipe, which is written, or a folder
+        path.write_bytes(content)
+        return
+    path = path.resolve()  # a link stays one
     temporary = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
     removes(temporary)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,6 +145,15 @@ def make_folder(out: Path, removed: Sequence[str] = ()) -> None:
                 path.unlink()
     except OSError as error:
         raise cannot_write(f"--out {out}", error) from None
+
+
+def keep_sources(option: str, written: Iterable[Path], *read: Path) -> None:
+    """UsageError, a line that begins with the option: a file that is to be written is one that is read, by whatever
+    name."""
+    for path in written:
+        for source in read:
+            if path.exists() and source.exists() and path.samefile(source):
+                raise UsageError(f"{option}: {source} is read, and would be overwritten; name another file")
 
 
 def bundled_or_path(name_or_path: str, folder: Path, suffix: str, key: str, *more: Path) -> Path:

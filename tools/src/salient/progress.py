@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from typing import TextIO
 
 _BAR_WIDTH = 24
@@ -11,7 +13,12 @@ _LINES_MAX = 20
 
 def steps_of(items: int, stream: TextIO) -> int:
     """Number of steps for the items of a list that may be long: all of them in place, _LINES_MAX lines at most."""
-    return items if stream.isatty() else min(items, _LINES_MAX)
+    return items if _is_in_place(stream) else min(items, _LINES_MAX)
+
+
+def _is_in_place(stream: TextIO) -> bool:
+    """Whether a stream is a terminal that can erase a line."""
+    return stream.isatty() and os.environ.get("TERM", "dumb") != "dumb"
 
 
 class Progress:
@@ -21,7 +28,7 @@ class Progress:
     def __init__(self, total: int, stream: TextIO, items: int = 0) -> None:
         self._total, self._done, self._stream = total, 0, stream
         self._items, self._items_done = items, 0
-        self._in_place = stream.isatty()
+        self._in_place = _is_in_place(stream)
 
     def __enter__(self) -> Progress:
         return self
@@ -43,7 +50,9 @@ class Progress:
         if self._in_place:
             filled = _BAR_WIDTH * self._done // self._total
             bar = "#" * filled + "." * (_BAR_WIDTH - filled)
-            self._write(f"{_ERASE_LINE}[{bar}] {self._done}/{self._total} {what}")
+            line = f"[{bar}] {self._done}/{self._total} {what}"
+            # One that is as wide as the terminal would go on in the next, which is not erased.
+            self._write(f"{_ERASE_LINE}{line[: shutil.get_terminal_size().columns - 1]}")
         else:
             self._write(f"{self._done}/{self._total} {what}\n")
 

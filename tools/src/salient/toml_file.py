@@ -163,6 +163,8 @@ def _one_line(error: ValidationError, model: type[Table], section: str) -> str:
         return f"{key}: missing"
     if found["type"] == "extra_forbidden":
         return f"{key}: unknown key; {close_names(last, _keys(model, place[:-1]))}"
+    if found["type"] == "string_type":
+        return f"{key}: {shown(found['input'])}: must be a text"
     if found["type"] == "must_be":
         return f"{key}: {shown(found['input'])}: {found['msg']}"
     if found["type"] in ("model_type", "dict_type"):

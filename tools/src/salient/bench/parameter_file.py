@@ -21,6 +21,7 @@ from salient.bench.session import SILENCE_MAX_S, Session
 from salient.config import either
 from salient.errors import UsageError, close_names, shown
 from salient.machine.parameter_table import CHOICES, value_name, value_number
+from salient.paths import write_whole
 from salient.toml_file import TextFileError, read_toml
 
 
@@ -48,8 +49,7 @@ def save(session: Session, path: Path) -> int:
         value = named(row, parameters[name])
         lines.append(f"{name} = {json.dumps(value) if name in CHOICES and not value.isdigit() else value}  # {comment}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_whole(path, ("\n".join(lines) + "\n").encode())
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     print(f"{len(parameters)} parameters: {path}")

@@ -9,16 +9,22 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import cantools
 from cantools.database.can import Database, Message
 
 from salient.bus.signals import FrameKey, big_endian_bit, drive_database, frame_key, rig_database
-from salient.errors import UsageError
+from salient.errors import UsageError, shown
 from salient.machine.map_import.text import decode
+from salient.toml_file import TextFileError, read_bytes
 
 OPTION = "--dbc"
 _REASON_MAX = 160  # characters of what the parser says
+_FILE_BYTES_MAX = 100_000_000
+_MESSAGE_BYTES_MAX = 100_000
+"""Length of a message of a transport protocol; J1939 has 1785 bytes, ISO 15765 4095."""
+_CYCLE_MAX_MS = 1_000_000_000
 _FRAME_BYTES_MAX = 64
 _BITS_MAX = 64
 """Length of a signal that is decoded."""
@@ -66,10 +72,13 @@ def identifier_text(identifier: int, is_extended: bool) -> str:
 
 def _load(path: Path) -> Database:
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{OPTION} {path}: {error.strerror}") from None
-    text = decode(data)
+        text = decode(read_bytes(path, _FILE_BYTES_MAX))
+    except TextFileError as error:
+        raise UsageError(f"{OPTION} {path}: {error}") from None
+    for name, length in re.findall(r"(?m)^[ \t]*BO_ +\S+ +(\w+) *: *([0-9]+)", text):
+        if int(length) > _MESSAGE_BYTES_MAX:  # the parser takes time and memory for each bit of it
+            raise UsageError(f"{OPTION} {path}: no valid DBC: {name} has {shown(int(length))} bytes, at most "
+                             f"{_MESSAGE_BYTES_MAX}")
     logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of is an error here
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, prune_choices=False)
@@ -89,6 +98,7 @@ def _load(path: Path) -> Database:
                        "out")
             database.messages.remove(message)
             continue
+        _check_cycle(path, message)
         _check(path, message)
         _name_signals(path, message)
     if not database.messages:
@@ -98,6 +108,16 @@ def _load(path: Path) -> Database:
 
 def _say(path: Path, text: str) -> None:
     print(f"salient: {OPTION} {path}: {text}", file=sys.stderr, flush=True)
+
+
+def _check_cycle(path: Path, message: Message) -> None:
+    """Leaves a cycle time out, with a line, that is no time: its attribute can have any type and value."""
+    cycle: Any = message.cycle_time
+    if cycle is None or (isinstance(cycle, int | float) and 0 <= cycle <= _CYCLE_MAX_MS):
+        return
+    _say(path, f"{message.name} has the cycle time {shown(cycle)}, which is left out; it is a number of ms from 0 to "
+               f"{_CYCLE_MAX_MS}")
+    message.cycle_time = None
 
 
 def _check(path: Path, message: Message) -> None:

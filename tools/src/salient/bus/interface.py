@@ -192,7 +192,8 @@ class SalientBus(can.BusABC):
         except OSError as error:
             self._socket.close()
             self._is_shutdown = True
-            raise can.CanInitializationError(f"unix:{self._path}: no drive answers there ({error.strerror})") from error
+            reason = error.strerror or str(error)  # of a path that is too long Python has no errno
+            raise can.CanInitializationError(f"unix:{self._path}: no drive answers there ({reason})") from error
         self._socket.setblocking(False)
         super().__init__(channel=channel, can_filters=can_filters, **options)
 

@@ -3,6 +3,7 @@ be compared; microseconds), and decoded signals instead of frames: MF4, CSV and 
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
@@ -182,6 +183,12 @@ def _asc_event(message: can.Message) -> str:
     kind = "r" if message.is_remote_frame else "d"
     return ASCWriter.FORMAT_MESSAGE.format(
         channel=1, id=identifier, dir="Rx", dtype=f"{kind} {message.dlc:x}", data=data).rstrip()
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The files there are that a RotatingLog of this path would write, should it be long enough."""
+    name = re.compile(rf"{re.escape(path.stem)}_[0-9]{{{_NUMBER_DIGITS},}}{re.escape(path.suffix)}")
+    return [each for each in path.parent.glob("*") if name.fullmatch(each.name)]
 
 
 class RotatingLog:

@@ -14,13 +14,14 @@ from cantools.database.can import Database
 from salient.bus.blf_reader import read_blf
 from salient.bus.clock import nodes_of_messages
 from salient.bus.databases import messages_of
-from salient.bus.log import DECODED_SUFFIXES, open_log
+from salient.bus.log import DECODED_SUFFIXES, open_log, parts_of
 from salient.bus.log_input import Damage, LogInput
 from salient.bus.mf4_reader import read_mf4
 from salient.bus.signals import FrameKey, FrameKeys, frame_key
 from salient.bus.text_logs import Frames, nanoseconds, read_text
 from salient.config import READABLE_SUFFIXES, Rotation, either
 from salient.errors import RunFailed, UsageError
+from salient.paths import keep_sources
 
 _TIME_MAX_NS = 1 << 62  # a century and a half; the columns of signals have 64 bits
 
@@ -88,12 +89,11 @@ def convert(source: Path, target: Path, machine: str | None, node: int = 0, rota
     """Writes the frames of a log to another, whose suffix is the format; returns their number and the place.
     rotation, others: see open_log.
 
-    UsageError: a file cannot be read or written; OtherDatabase: see Carrier; then there is no target. LogDamaged: see
-    read_log; the target has the frames before. NoKnownFrame: there is none of a drive, and of a format with decoded
-    signals no target either.
+    UsageError: a file cannot be read or written, or the log would be overwritten; OtherDatabase: see Carrier; then
+    there is no target. LogDamaged: see read_log; the target has the frames before. NoKnownFrame: there is none of a
+    drive, and of a format with decoded signals no target either.
     """
-    if source.resolve() == target.resolve():
-        raise UsageError(f"--out {target}: must be another file than --convert {source}")
+    keep_sources(f"--out {target}", [target] if rotation is None else parts_of(target), source)
     frames = read_log(source)
     first = next(frames, None)  # a file of another format leaves an existing target as it is
     if first is None:

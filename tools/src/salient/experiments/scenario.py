@@ -76,7 +76,7 @@ from salient.experiments.metrics import losses
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
-from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, validate
+from salient.toml_file import Table, TextFileError, any_number, number, one_of, option, read_toml, shown_key, validate
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def _check_parameter_names(scenario: Scenario, config: BenchConfig) -> None:
     for name, value in scenario.parameters.items():
         row = rows.get(name)
         if row is None:
-            raise UsageError(f"parameters.{name}: unknown parameter; {close_names(name, rows)}")
+            raise UsageError(f"parameters.{shown_key(name)}: unknown parameter; {close_names(name, rows)}")
         if not row.minimum <= value <= row.maximum:
             allowed = f"{row.minimum:g} to {row.maximum:g} {row.unit}".rstrip()
             raise UsageError(f"parameters.{name}: {value:g}: must be a number from {allowed}")

@@ -125,7 +125,7 @@ def read_results(out: Path) -> dict[str, Any]:
             try:
                 entry = json.loads(line)
                 results[entry["key"]] = entry["result"]
-            except (ValueError, TypeError, KeyError):
+            except (ValueError, TypeError, KeyError, RecursionError):
                 raise UsageError(f"{path}, line {number}: not the result of a run; choose another folder") from None
     return results
 

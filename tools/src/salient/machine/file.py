@@ -140,9 +140,12 @@ MAGNETICS: dict[str, type[Table]] = {"map": MapMagnetics} | {
 """The table [magnetics] by its form."""
 
 
-class MachineFile(Table):
+class Named(Table):
     name: Annotated[str, checked("a word of letters, digits and underscores",
                                  lambda name: name.isidentifier() and name.isascii())]
+
+
+class MachineFile(Named):
     poles: Poles
     winding: Winding
     mechanics: Mechanics

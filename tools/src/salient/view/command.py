@@ -171,6 +171,6 @@ def _log_of(path: Path) -> tuple[Path, dict[str, Any]]:
         raise UsageError(f"--replay {path}: a folder must have can.blf, as that of a failed test has")
     try:
         notes = json.loads((folder / _FAILURE_NOTES).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         notes = {}
     return log, notes if isinstance(notes, dict) else {}

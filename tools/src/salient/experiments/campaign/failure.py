@@ -200,6 +200,6 @@ def load(folder: Path) -> Failure:
         bug = note.get("bug")
         return Failure(int(note["seed"]), int(note["kept"], 16), _kind(note["kind"]),
                        None if bug is None else str(bug))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "
                          "campaign has left") from None

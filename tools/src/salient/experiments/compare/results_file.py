@@ -76,7 +76,7 @@ def read(path: Path, quick: bool) -> dict[str, Any]:
         stored = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"--baseline {file}: {error.strerror}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise UsageError(f"--baseline {file}: not JSON; pass the folder or the {NAME} of an earlier run") from None
     if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not isinstance(stored.get("rows"), list):
         raise UsageError(f"--baseline {file}: not a {NAME} of schema {SCHEMA}")

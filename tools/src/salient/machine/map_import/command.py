@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from salient.errors import UsageError
-from salient.machine.file import Poles, poles_and_phases
+from salient.machine.file import Named, Poles, poles_and_phases
 from salient.machine.flux_map import FluxMapError
 from salient.machine.flux_map_csv import FILE_BYTES_MAX, map_of_text
 from salient.machine.map_import.correct import Imported, Supply, correct
 from salient.machine.map_import.layouts import Points, points_of
 from salient.machine.map_import.mat import is_mat, is_octave, mat_points, octave_points
 from salient.machine.map_import.text import blocks, decode
+from salient.paths import keep_sources
 from salient.toml_file import TextFileError, read_bytes, read_text, read_toml, validate
 
 _BINARY = {b"PK\x03\x04": ("a spreadsheet or another ZIP file", "save the table as CSV"),
@@ -30,6 +31,8 @@ def import_map(machine: Path, table: Path, out: Path) -> tuple[Path, list[str]]:
     try:
         data = read_toml(machine)
         stator, rotor, phases = poles_and_phases(validate(Poles, data.get("poles", {}), "poles"))
+        # It is a part of the paths that are written, which must not lead out of the folder.
+        name = validate(Named, {key: value for key, value in data.items() if key == "name"}).name
         supply = Supply(_number(data, "converter", "supply_voltage_V"), _number(data, "winding", "resistance_ohm"))
         source = read_text(machine, 1_000_000)
     except TextFileError as error:
@@ -40,11 +43,8 @@ def import_map(machine: Path, table: Path, out: Path) -> tuple[Path, list[str]]:
         map_of_text(text, rotor)
     except FluxMapError as error:
         raise UsageError(f"{table}: {error}") from None
-    name = str(data.get("name", machine.stem))
     paths = (out / f"{name}.csv", out / f"{name}.toml")
-    for path in paths:
-        if path.exists() and any(path.samefile(given) for given in (machine, table)):
-            raise UsageError(f"--out {out}: {path.name} there is a file that is read; name another folder")
+    keep_sources(f"--out {out}", paths, machine, table)
     try:
         machine_text = with_map(source, data, paths[0].name, table.name)
     except TextFileError as error:
