@@ -17,6 +17,7 @@
 #include "stm32g4/timer.h"
 
 #define BOOT_LIMIT_NS UINT64_C(5000000000)
+#define ENCODER_NS UINT64_C(15000000) /* start of the encoder: after the start of TIM2, before the crystal LSE's */
 #define NS_PER_S UINT64_C(1000000000)
 #define CSR_IWDGRSTF (1u << 29)
 #define CSR_POWER (3u << 26)
@@ -41,10 +42,6 @@ static void hold_time(bool held) {
 static void outputs_changed(void *context) {
     (void)context;
     bench.outputs_changed = true;
-    if (!bench.encoder_on && timers[TIM2].runs) { /* the encoder is powered and counts to its position */
-        bench.encoder_on = true;
-        bench_io_encoder();
-    }
     if (!bench.started && timers[TIM1].runs) {
         bench.started = true;
         bench.start_cycle = soc.now;
@@ -66,19 +63,31 @@ static uint64_t period_cycles(void) {
     return timer_period(&timers[TIM1]) * timers[TIM1].tick;
 }
 
+/* The encoder counts to its position, with the part or without it: edges that TIM2 does not count are lost. */
+static void encoder_starts(void) {
+    bench.encoder_on = true;
+    bench_io_encoder();
+}
+
 /* Until the processor sleeps after the start of TIM1. */
 static void boot(void) {
     bench.started = bench.encoder_on = false;
     soc.untimed = false;
-    const uint64_t limit = soc_ns(soc.now) + BOOT_LIMIT_NS;
+    const uint64_t encoder_from = soc_ns(soc.now) + ENCODER_NS, limit = soc_ns(soc.now) + BOOT_LIMIT_NS;
     while (!bench.started || !cpu.asleep) {
-        cpu_run(soc_cycle_of_ns(limit), true);
+        cpu_run(soc_cycle_of_ns(bench.encoder_on ? limit : encoder_from), true);
+        if (!bench.encoder_on && soc_ns(soc.now) >= encoder_from) {
+            encoder_starts();
+        }
         if (cpu.exited || soc.reset_request || soc_ns(soc.now) >= limit) {
             soc_violation("TIM1 has not been started within 5 s of the reset");
         }
         if (!bench.started && cpu.asleep) {
             soc_advance(soc.next < soc_cycle_of_ns(limit) ? soc.next : soc_cycle_of_ns(limit));
         }
+    }
+    if (!bench.encoder_on) {
+        encoder_starts();
     }
     const uint64_t length_ns = period_cycles() * NS_PER_S / soc.hclk_hz;
     const uint64_t ticks = pwm_timer_ticks(length_ns) / 2;

@@ -30,6 +30,9 @@
 #define RNG_SR (RNG + 0x04)
 #define RNG_DR (RNG + 0x08)
 #define RNGEN 4u
+#define RNG_SEIS 0x40u
+#define RNG_ERROR 0x44u /* SEIS, SECS */
+#define PIPELINE_WORDS 12u
 #define RANDOM_NS 4000u /* about 200 cycles of 48 MHz for a number */
 #define NS_PER_S 1e9
 
@@ -45,6 +48,7 @@ static struct {
     void *random_context;
     uint64_t state;
     uint64_t number_ready_ns; /* RNG_DR has the next number */
+    unsigned stale;           /* words of the pipeline that a seed error has left */
 } apart;
 
 /* --- Independent watchdog --- */
@@ -112,11 +116,17 @@ void apart_set_lse(apart_lse_t lse, void *context) {
 }
 
 static bool random_ready(void) {
-    return REG(RNG_CR) & RNGEN && (soc.untimed || soc_ns(soc.now) >= apart.number_ready_ns);
+    return REG(RNG_CR) & RNGEN && !(REG(RNG_SR) & RNG_SEIS) &&
+           (soc.untimed || soc_ns(soc.now) >= apart.number_ready_ns);
 }
 
 static void next_random(void) {
     apart.number_ready_ns = soc_ns(soc.now) + RANDOM_NS;
+}
+
+void apart_seed_error(void) {
+    REG(RNG_SR) |= RNG_ERROR;
+    apart.stale = PIPELINE_WORDS;
 }
 
 static uint32_t apart_read(uint32_t address) {
@@ -127,7 +137,7 @@ static uint32_t apart_read(uint32_t address) {
         if (REG(RNG_CR) & RNGEN && !rcc_hsi48_ready()) {
             soc_violation("read of RNG_SR: its 48 MHz clock does not run (RCC_CRRCR, RCC_CCIPR.CLK48SEL)");
         }
-        return random_ready();
+        return REG(RNG_SR) | random_ready();
     case RNG_DR:
         if (!(REG(RNG_CR) & RNGEN)) {
             soc_violation("read of RNG_DR: RNG_CR.RNGEN is 0");
@@ -136,6 +146,10 @@ static uint32_t apart_read(uint32_t address) {
             soc_violation("read of RNG_DR: RNG_SR.DRDY is 0, it reads as zero");
         }
         next_random();
+        if (apart.stale > 0) {
+            --apart.stale;
+            return APART_STALE;
+        }
         if (apart.random) {
             return apart.random(apart.random_context);
         }
@@ -195,6 +209,9 @@ static void rng_write(uint32_t address, uint32_t value) {
     if (address == RNG_CR && value & RNGEN && !(REG(RNG_CR) & RNGEN)) {
         next_random();
     }
+    if (address == RNG_SR) { /* zeros clear; SECS tells the present state */
+        value = value & REG(RNG_SR) & RNG_SEIS ? RNG_ERROR : 0;
+    }
     REG(address) = value;
 }
 
@@ -211,4 +228,5 @@ void apart_attach(void) {
 
 void apart_reset(void) {
     apart.runs = apart.unlocked = apart.counts = false;
+    apart.stale = 0;
 }

@@ -364,7 +364,7 @@ static void torn_read(uc_engine *uc, uc_mem_type type, uint64_t address, int siz
     (void)size;
     (void)value;
     (void)context;
-    flash_double_error((uint32_t)address - FLASH_BASE, false);
+    flash_double_error((uint32_t)address - FLASH_BASE);
 }
 
 void cpu_tear(uint32_t address) {

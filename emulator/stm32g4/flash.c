@@ -111,6 +111,9 @@ static void fail(uint32_t flag) {
 }
 
 static void begin(uint64_t ns, unsigned first, unsigned count) {
+    if (REG(ACR) & ACR_DCEN) {
+        soc_violation("an operation in bank 2 with FLASH_ACR.DCEN: reads of bank 1 may corrupt the data cache");
+    }
     flash.cached = true;
     flash.first_changing = first;
     flash.changing = count;
@@ -199,9 +202,9 @@ void flash_bank_2_write(uint32_t offset, uint32_t value, unsigned size) {
     }
 }
 
-void flash_double_error(uint32_t offset, bool bank_2) {
+void flash_double_error(uint32_t offset) {
     if (!(REG(ECCR) & ECCR_ECCD)) {
-        REG(ECCR) = (REG(ECCR) & 1u << 24) | ECCR_ECCD | (bank_2 ? 1u << 21 : 0) | ((offset & ~7u) & 0x7FFFF);
+        REG(ECCR) = (REG(ECCR) & 1u << 24) | ECCR_ECCD | ((offset & ~7u) & 0x7FFFF);
         nvic_line(NMI, true);
     }
 }
@@ -222,7 +225,7 @@ uint32_t flash_bank_2_read(uint32_t offset, unsigned size) {
     const unsigned double_word = offset / 8;
     const uint64_t value = content(double_word);
     if (flash.torn[double_word]) {
-        flash_double_error(offset, true);
+        flash_double_error(0); /* worst case: ECCR has kept the address of an earlier, corrected error in bank 1 */
     }
     return (uint32_t)(value >> 8 * (offset % 8));
 }

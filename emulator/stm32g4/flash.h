@@ -20,7 +20,7 @@ unsigned flash_wait_states(void);
 void *flash_system_memory(void);
 
 /* A read of bank 1 or 2 has found a double error. */
-void flash_double_error(uint32_t offset, bool bank_2);
+void flash_double_error(uint32_t offset);
 
 /* The data cache has been emptied. */
 void flash_cache_emptied(void);

@@ -83,7 +83,7 @@ static int set_analog(const char *value) {
 
 /* The program is its own bench: stimulus port 1 gives a pin a code, port 2 a level; number of the pin in the upper half
  * of the word. Port 3: errors of the bus, transmit counter, receive counter << 8, bus-off << 16. Port 4: address of a
- * word of bank 1 with a double error. */
+ * word of bank 1 with a double error. Port 5: a seed error of the random numbers. */
 static void stimulus(unsigned port, uint32_t value) {
     const unsigned pin = value >> 16;
     if (port == 3) {
@@ -92,6 +92,10 @@ static void stimulus(unsigned port, uint32_t value) {
     }
     if (port == 4) {
         cpu_tear(value);
+        return;
+    }
+    if (port == 5) {
+        apart_seed_error();
         return;
     }
     if (pin >= GPIO_PINS) {

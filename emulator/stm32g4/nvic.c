@@ -13,10 +13,11 @@
 #define PENDSV 14u
 #define SYSTICK 15u
 #define NO_PRIORITY 256
-#define STIMULUS_PORTS 5u
+#define STIMULUS_PORTS 6u
 
 static struct {
     uint64_t pending[WORDS], enabled[WORDS], active[WORDS], level[WORDS];
+    uint64_t fell[WORDS]; /* the request has ended since the last read of a peripheral */
     int16_t priority[CPU_EXCEPTIONS];
     uint8_t group_shift; /* PRIGROUP */
     uint32_t vectors, scr, ccr, demcr, dwt_control;
@@ -105,15 +106,27 @@ void nvic_leave(unsigned exception) {
     if (!get(nvic.active, exception)) {
         soc_violation("return from exception %u, which is not active", exception);
     }
+    if (get(nvic.fell, exception)) {
+        soc_violation("return from exception %u, whose request has ended by the last access to a peripheral: the store "
+                      "may still be on its way, and the exception comes again",
+                      exception);
+    }
     put(nvic.active, exception, false);
     if (get(nvic.level, exception)) {
         put(nvic.pending, exception, true);
     }
 }
 
+void nvic_settle(void) {
+    memset(nvic.fell, 0, sizeof nvic.fell);
+}
+
 void nvic_line(unsigned exception, bool level) {
     if (level && !get(nvic.level, exception)) {
         put(nvic.pending, exception, true);
+    }
+    if (level || get(nvic.level, exception)) {
+        put(nvic.fell, exception, !level);
     }
     put(nvic.level, exception, level);
 }

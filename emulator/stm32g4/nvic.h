@@ -23,6 +23,9 @@ void nvic_enter(unsigned exception);
 void nvic_leave(unsigned exception);
 
 void nvic_line(unsigned exception, bool level);
+
+/* A peripheral has been read: stores of before have arrived, and the requests that they have ended are gone. */
+void nvic_settle(void);
 void nvic_pend(unsigned exception);
 bool nvic_is_active(unsigned exception);
 

@@ -116,5 +116,7 @@ typedef uint32_t (*apart_random_t)(void *context);
 void apart_set_random(apart_random_t random, void *context);
 typedef uint64_t (*apart_lse_t)(void *context); /* cycles of the crystal since any instant */
 void apart_set_lse(apart_lse_t lse, void *context);
+#define APART_STALE 0x5EED5EEDu /* words of the random numbers' pipeline after a seed error */
+void apart_seed_error(void);
 
 #endif

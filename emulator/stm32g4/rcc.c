@@ -37,11 +37,12 @@ typedef enum { HSE, PLL, LSI, LSE, HSI48, OSCILLATORS } oscillator_t;
 
 /* Times of start, from the data sheet: typical; LSE: shortened from 2 s, which a run would spend in waiting. */
 static const uint32_t start_ns[OSCILLATORS] = {
-    [HSE] = 2000000, [PLL] = 40000, [LSI] = 130000, [LSE] = 1000000, [HSI48] = 2500};
+    [HSE] = 2000000, [PLL] = 40000, [LSI] = 130000, [LSE] = 10000000, [HSI48] = 2500};
 
 static uint32_t reset_flags;
 static uint64_t ready_ns[OSCILLATORS]; /* SOC_NEVER: off */
 static uint64_t halved_from_ns;        /* the system clock was selected */
+static bool access_seen;               /* PWR_CR1.DBP was read as one */
 
 static bool ready(oscillator_t oscillator) {
     return soc_ns(soc.now) >= ready_ns[oscillator];
@@ -267,6 +268,10 @@ static void bdcr_write(uint32_t value) {
     if (!(REG(PWR_CR1) >> 8 & 1)) {
         soc_violation("write of RCC_BDCR, value 0x%X: PWR_CR1.DBP is 0, the backup domain is protected", value);
     }
+    if (!access_seen) {
+        soc_violation("write of RCC_BDCR, value 0x%X: PWR_CR1.DBP has not been read back, and is on another bus",
+                      value);
+    }
     REG(BDCR) = value & 0x0301833D;
     run(LSE, value & 1);
 }
@@ -306,8 +311,14 @@ static void rcc_write(uint32_t address, uint32_t value) {
     }
 }
 
+static uint32_t pwr_read(uint32_t address) {
+    access_seen = access_seen || (address == PWR_CR1 && REG(PWR_CR1) >> 8 & 1);
+    return REG(address);
+}
+
 static void pwr_write(uint32_t address, uint32_t value) {
     REG(address) = value;
+    access_seen = access_seen && REG(PWR_CR1) >> 8 & 1;
     if (address == PWR_CR1 || address == PWR_CR5) {
         clocks_changed();
     }
@@ -326,7 +337,7 @@ static void acr_write(uint32_t address, uint32_t value) {
 
 void rcc_attach(void) {
     soc_attach(RCC, 0x400, 0, 0, rcc_read, rcc_write);
-    soc_attach(0x40007000u, 0x400, RCC + 0x58, 28, 0, pwr_write);
+    soc_attach(0x40007000u, 0x400, RCC + 0x58, 28, pwr_read, pwr_write);
     soc_attach(FLASH_ACR, 4, RCC + 0x48, 8, 0, acr_write);
 }
 
@@ -341,5 +352,6 @@ void rcc_reset(uint32_t cause) {
     reset_flags = (cause & CSR_BORRSTF ? 0 : reset_flags) | (cause & CSR_RESET_FLAGS); /* until RMVF, or power-on */
     REG(CSR) = reset_flags;
     halved_from_ns = 0;
+    access_seen = false;
     clocks_changed();
 }

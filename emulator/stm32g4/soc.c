@@ -8,6 +8,7 @@
 
 #include "stm32g4/cpu.h"
 #include "stm32g4/flash.h"
+#include "stm32g4/nvic.h"
 #include "stm32g4/peripherals.h"
 
 #define ATTACHMENTS_MAX 64
@@ -141,6 +142,7 @@ uint32_t soc_read(uint32_t address, unsigned size) {
         soc_violation("read of %s (0x%08X): write-only", row->name, address);
     }
     const uint32_t word = attachment->read ? attachment->read(address & ~3u) : REG(address & ~3u);
+    nvic_settle();
     return word >> 8 * (address & 3);
 }
 

@@ -29,6 +29,7 @@ struct hal {
     uint8_t temperature_sensor; /* being converted */
     uint16_t reference_low;     /* second clock: its counter when last read, and the counts until then */
     uint64_t reference_ticks;
+    volatile bool reads_parameters;    /* a double error of the flash is one of theirs */
     volatile uint32_t received_pushed; /* counts, not indices; written by the CAN interrupt */
     volatile uint32_t received_popped; /* written by the background */
     volatile uint32_t receive_overflows;
@@ -83,7 +84,7 @@ bool encoder_is_absolute(void);
 /* The CAN interrupt. */
 void can_interrupt(hal_t *hal);
 
-/* A double error of the flash, in the NMI: true when it lies in the parameters, and is dealt with. */
+/* A double error of the flash, in the NMI: true when the parameters are being read, and it is dealt with. */
 bool nvm_error_in_parameters(void);
 
 /* Opens the switches and stays there until the watchdog resets the processor. */

@@ -20,7 +20,6 @@
 #define FDCAN_PCLK 2u
 #define LPTIM_LSE 3u
 #define CLK48_HSI48 0u
-#define LSE_START_MS 3000u /* of the crystal, at most 2 s by the data sheet */
 
 void board_wait_us(uint32_t time_us, uint32_t clock_mhz) {
     /* Three cycles or more per turn. */
@@ -65,13 +64,12 @@ static void system_clock(void) {
     RCC_CR |= RCC_CR_CSSON; /* a crystal that stops breaks TIM1 and TIM8, and requests the NMI */
 }
 
-/* Without the crystal LSE the second clock stands still, and the self-test of the drive reports it. */
+/* Starts the crystal LSE, for which time_init waits. */
 static void second_clock(void) {
     PWR_CR1 |= PWR_CR1_DBP;
-    RCC_BDCR |= RCC_BDCR_LSEON;
-    for (uint32_t ms = 0; ms < LSE_START_MS && !(RCC_BDCR & RCC_BDCR_LSERDY); ms++) {
-        board_wait_us(1000, BOARD_CLOCK_MHZ);
+    while (!(PWR_CR1 & PWR_CR1_DBP)) { /* RCC is on another bus: the access is there before the write that needs it */
     }
+    RCC_BDCR |= RCC_BDCR_LSEON;
 }
 
 void clock_init(void) {

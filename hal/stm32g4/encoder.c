@@ -11,7 +11,8 @@
 #define CCS_TRC 3u
 #define FILTER_4 2u /* samples of the timer's clock, 24 ns at 170 MHz */
 
-/* Before everything that takes long: an encoder that counts to its absolute position does so after its own start. */
+/* Before everything that takes long, as the crystal LSE does: an encoder that counts to its absolute position does so
+ * after its own start, and the edges that nothing counts are lost. */
 void encoder_init(void) {
     TIM_SMCR(TIM2_BASE) = PUT(TIM_SMCR_TS, TS_ITR0); /* while no mode uses it */
     TIM_SMCR(TIM2_BASE) = PUT(TIM_SMCR_TS, TS_ITR0) | PUT(TIM_SMCR_SMS, SMS_ENCODER_BOTH);

@@ -18,24 +18,35 @@ static volatile uint32_t *address(unsigned page, unsigned word) {
     return (volatile uint32_t *)(uintptr_t)(BANK_2 + PAGE_BYTES * page + sizeof(uint64_t) * word);
 }
 
-/* An erased word reads as ones. A torn one may have a double error: the NMI has dealt with it when the read returns. */
+/* An erased word reads as ones. A torn one may have a double error: the NMI has dealt with it when the read returns. A
+ * mark tells the NMI whose error it is: ECCR has the address of the first error since its flags were cleared, which a
+ * corrected one of the program may be. Nothing else runs meanwhile. */
 uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word) {
     (void)hal;
     const volatile uint32_t *at = address(page, word);
+    uint32_t primask;
+    __asm__ volatile("mrs %0, primask\n\tcpsid i" : "=r"(primask)::"memory");
+    board.reads_parameters = true;
     const uint32_t low = at[0];
-    return (uint64_t)at[1] << 32 | low;
+    const uint32_t high = at[1];
+    __asm__ volatile("dsb\n\tisb" ::: "memory"); /* the NMI of a double error comes here at the latest */
+    board.reads_parameters = false;
+    __asm__ volatile("msr primask, %0" ::"r"(primask) : "memory");
+    return (uint64_t)high << 32 | low;
 }
 
 bool nvm_error_in_parameters(void) {
-    const uint32_t error = FLASH_ECCR;
-    if (!(error & (FLASH_ECCR_ECCD | FLASH_ECCR_ECCD2)) || !(error & FLASH_ECCR_BK_ECC)) {
+    if (!board.reads_parameters) {
         return false;
     }
-    FLASH_ECCR = error | FLASH_ECCR_ECCD | FLASH_ECCR_ECCD2;
+    FLASH_ECCR |= FLASH_ECCR_ECCD | FLASH_ECCR_ECCD2;
+    (void)FLASH_ECCR; /* the flag has gone before the return: else the NMI comes again, and finds none */
     return true;
 }
 
-/* Begins an operation: false while the flash has a single bank, where it would stall the program. */
+/* Begins an operation: false while the flash has a single bank, where it would stall the program. Without the
+ * data cache, which the program's reads of bank 1 may corrupt during an operation in bank 2: ST's drivers do the same.
+ */
 static bool begin(void) {
     if (!(FLASH_OPTR & FLASH_OPTR_DBANK) || (FLASH_SR & FLASH_SR_BSY)) {
         return false;
@@ -45,6 +56,7 @@ static bool begin(void) {
         FLASH_KEYR = KEY_2;
     }
     FLASH_SR = ERRORS | FLASH_SR_EOP; /* errors of before would forbid the operation */
+    FLASH_ACR &= ~FLASH_ACR_DCEN;
     return true;
 }
 
@@ -58,7 +70,6 @@ static bool end(hal_t *hal) {
     } while (!done && hal_time_us(hal) - from_us < OPERATION_MAX_US);
     const bool right = done && !(FLASH_SR & ERRORS);
     FLASH_CR = FLASH_CR_LOCK;
-    FLASH_ACR &= ~FLASH_ACR_DCEN;
     FLASH_ACR |= FLASH_ACR_DCRST;
     FLASH_ACR &= ~FLASH_ACR_DCRST;
     FLASH_ACR |= FLASH_ACR_DCEN;

@@ -9,6 +9,7 @@
 #define REFERENCE_US 15625u
 #define REFERENCE_TICKS 512u
 #define REFERENCE_MAX 0xFFFFu
+#define LSE_START_MS 3000u /* of the crystal, at most 2 s by the data sheet */
 
 #define IWDG_START 0xCCCCu
 #define IWDG_UNLOCK 0x5555u
@@ -17,7 +18,11 @@
 #define IWDG_PRESCALER 4u /* code 0 of PR */
 #define IWDG_COUNTS (HAL_WATCHDOG_TIMEOUT_US / 1000u * LSI_HZ / IWDG_PRESCALER / 1000u)
 
+/* Without the crystal LSE the second clock stands still, and the self-test of the drive reports it. */
 void time_init(void) {
+    for (uint32_t ms = 0; ms < LSE_START_MS && !(RCC_BDCR & RCC_BDCR_LSERDY); ms++) {
+        board_wait_us(1000, BOARD_CLOCK_MHZ);
+    }
     TIM_CR1(TIM5_BASE) = TIM_CR1_URS;
     TIM_PSC(TIM5_BASE) = BOARD_CLOCK_MHZ - 1u;
     TIM_ARR(TIM5_BASE) = UINT32_MAX;

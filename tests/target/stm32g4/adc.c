@@ -14,6 +14,7 @@ static void converted(void) {
     data[0] = REG(ADC1 + 0x80);
     data[1] = REG(ADC1 + 0x84);
     ISR = BIT(6); /* JEOS, write one to clear */
+    (void)ISR;
 }
 
 int test(void) {

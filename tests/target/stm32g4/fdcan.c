@@ -11,6 +11,7 @@ static volatile unsigned calls;
 static void received(void) {
     ++calls;
     REG(CAN + 0x50) = BIT(0);
+    (void)REG(CAN + 0x50);
 }
 
 static void send(unsigned buffer, uint32_t identifier, uint32_t length, uint32_t word) {

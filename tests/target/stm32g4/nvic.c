@@ -28,6 +28,7 @@ static void pendsv(void) {
 static void update(void) {
     if (++levels == 3) {
         SR(TIM6) = 0; /* a level: pends until the flag is cleared */
+        (void)SR(TIM6);
     }
 }
 

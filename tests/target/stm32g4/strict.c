@@ -1,6 +1,12 @@
 /* One breach of a rule, which ends the run; CASE numbers them as the test does. */
 #include "part.h"
 
+#if CASE == 26
+static void clears_at_its_end(void) {
+    REG(TIM2 + 0x10) = 0;
+}
+#endif
+
 int test(void) {
 #if CASE == 0
     CR1(TIM1) = 1; /* without clock */
@@ -58,11 +64,13 @@ int test(void) {
 #elif CASE == 17
     REG(0x40022008u) = 0x45670123;
     REG(0x40022008u) = 0xCDEF89AB;
+    REG(0x40022000u) &= ~BIT(10);
     REG(0x40022014u) = 1;
     REG(0x08040000u) = 1;
     REG(0x08040004u) = 2;
     while (REG(0x40022010u) & BIT(16)) {
     }
+    REG(0x40022000u) |= BIT(10);
     (void)REG(0x08040000u); /* from the data cache */
 #elif CASE == 18
     REG(0x40022000u) |= BIT(12); /* DCRST with DCEN */
@@ -90,6 +98,22 @@ int test(void) {
 #elif CASE == 23
     AHB2ENR |= BIT(13);
     REG(0x5000004Cu) = 8u << 2 | 2u << 7; /* JSQR: falling edge of TRGO2 */
+#elif CASE == 24
+    REG(0x40022008u) = 0x45670123;
+    REG(0x40022008u) = 0xCDEF89AB;
+    REG(0x40022014u) = BIT(1) | BIT(11);
+    REG(0x40022014u) |= BIT(16); /* an erasure with the data cache */
+#elif CASE == 25
+    APB1ENR1 |= BIT(28);
+    REG(0x40007000u) |= BIT(8);
+    REG(RCC + 0x90) = 1; /* LSEON before DBP was read */
+#elif CASE == 26
+    vectors[16 + 28] = clears_at_its_end;
+    APB1ENR1 |= BIT(0);
+    REG(0xE000E100u) = BIT(28);
+    REG(TIM2 + 0x0C) = 1;
+    REG(TIM2 + 0x14) = 1; /* UG: update interrupt */
+    barrier();
 #endif
     return 0;
 }

