@@ -122,6 +122,20 @@ def test_a_run_does_not_follow_from_experiments(identifying):
     assert bench.truth["speed_rpm"].last == pytest.approx(300, abs=5)
 
 
+def test_a_limit_of_earlier_experiments_does_not_refuse_the_next_ones(identifying):
+    """A hold for longer than the copper loss permits; the drive keeps the reason until its next run."""
+    bench = identifying()
+    with linked(bench) as link:
+        link.run(Experiment("pulse", 0, 0.1), 0.2)
+        with pytest.raises(IdentifyError, match="has had its copper loss"):
+            link.run(Experiment("hold", 0, 0.5), 6.0)
+    bench.run_for(0.05)
+    assert not bench.drive.armed
+    with linked(bench) as link:
+        assert len(link.rest(0.01)) > 5
+        link.check()
+
+
 @pytest.mark.parametrize("controller", ["traditional", "paper"])
 def test_other_controllers_are_refused_by_name(make_bench, controller):
     bench = make_bench(controller=controller, telemetry_period_ms=20)

@@ -32,6 +32,9 @@ AREA_PARAMETERS, AREA_SCOPE, AREA_TEXT = 0x10000000, 0x20000000, 0x30000000
 RESPONSE_TIMEOUT_S = 2.0
 """Long enough for a session whose time moves by itself, which reads what came before the response first."""
 _POLL_NS = 100_000
+_WALL_S = 600.0
+"""Wall time in which pyXCP takes a response that has come. Its own 2 s pass in a process that is stopped or starved;
+then it repeats the command, and takes the answer to each one for the answer to the next."""
 _UPLOAD, _DATA_BYTES = 0xF5, 7
 _RESPONSE, _ERROR, _EVENT, _FIRST_OF_RESPONSES = 0xFF, 0xFE, 0xFD, 0xFC
 """Events and service requests answer no command."""
@@ -133,6 +136,7 @@ def connected(session: LoggingClient) -> Iterator[Master]:
     application = create_application_from_config(
         {"Transport": {"CAN": {"interface": "custom", "can_id_master": command_id, "can_id_slave": response_id,
                                "max_dlc_required": True}}}, log_level=logging.CRITICAL)
+    application.transport.timeout = _WALL_S
     application.general.seed_n_key_function = key_of
     application.transport.layer = "CAN"
     master = Master("can", config=application, transport_layer_interface=interface)

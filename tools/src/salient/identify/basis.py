@@ -48,6 +48,8 @@ class FluxBasis:
 
     def _current(self, current_A: np.ndarray, derivative: int) -> np.ndarray:
         """i B(i), its derivative, or its integral from 0 on: (points, columns)."""
+        if not len(current_A):  # a phase without a pulse; BSpline takes no empty array
+            return np.zeros((0, self.columns))
         i = np.clip(current_A, 0.0, self.current_max_A * (1.0 - 1e-12))
         values = BSpline.design_matrix(i, self._knots, _DEGREE).toarray()
         if derivative == 0:

@@ -72,20 +72,25 @@ class Rows:
 
 
 def rows_of(found: Findings, pulses: Sequence[Pulse]) -> Rows:
-    """The samples with current of pulses."""
+    """The samples with current of pulses. IdentifyError: a phase has too few pulses."""
     parts: list[list[np.ndarray]] = []
     for number, pulse in enumerate(pulses):
         part = _rows(found, pulse)
         if part is not None:
             parts.append([np.full(len(part[0]), number), np.full(len(part[0]), found.phases.index(pulse.phase)), *part])
-    if not parts:
-        raise IdentifyError("no pulse has a current")
+    pulses_of = [sum(part[1][0] == row for part in parts) for row in range(len(found.phases))]
+    for phase, count in zip(found.phases, pulses_of, strict=True):
+        if count < _FOLDS:  # each phase in each fold, on the mean
+            raise IdentifyError(f"phase {'abcdef'[phase]}: {count} pulses with a current; its angle needs {_FOLDS}")
     return Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def common_current_A(pulses: Sequence[Pulse]) -> float:
-    """Largest current of most pulses."""
-    return float(np.quantile([pulse.log["current_A"].max() for pulse in pulses if pulse.mapped], _MOST))
+    """Largest current of most pulses. IdentifyError: none is one of the map."""
+    peaks_A = [pulse.log["current_A"].max() for pulse in pulses if pulse.mapped]
+    if not peaks_A:
+        raise IdentifyError("no pulse of the map")
+    return float(np.quantile(peaks_A, _MOST))
 
 
 def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
@@ -111,6 +116,8 @@ def _rows(found: Findings, pulse: Pulse) -> list[np.ndarray] | None:
     flux, charge, time_s = np.cumsum(sign * voltage * step_s), np.cumsum(mean_A * step_s), np.cumsum(step_s)
     turn = log["turn"][first + 1:last + 1]
     live = current[first + 1:last + 1] > floor_A
+    if not live.any():
+        return None
     at = np.arange(first + 1, last + 1)
     slope = (current[at] - current[at - 1]) / step_s
     columns = [2.0 * math.pi * (turn - found.position[pulse.phase]), 2.0 * math.pi * turn, current[at], flux, charge,
@@ -187,7 +194,8 @@ def _stiffness(fit: Fit) -> np.ndarray:
 
 
 def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
-    """Weights of the roughness by prediction of each pulse from the pulses of other folds, of the linear problem."""
+    """Weights of the roughness by prediction of each pulse from the pulses of other folds, of the linear problem.
+    IdentifyError: with no weights do these determine the machine."""
     folds = []
     for fold in range(_FOLDS):
         kept = rows.pulse % _FOLDS == fold
@@ -200,13 +208,22 @@ def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
         of_all = normal + sparse.diags(problem.ridge) + _forms(problem, smoothness)
         total = 0.0
         for design, weights, flux, of_normal, of_right in folds:
-            x = _solved(of_all - of_normal, right - of_right + problem.pull, problem.fit.basis)
+            try:
+                x = _solved(of_all - of_normal, right - of_right + problem.pull, problem.fit.basis)
+            except linalg.LinAlgError:
+                return math.inf
             total += float(weights @ (flux - design @ x)**2)
         return total
 
+    def best(candidates: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        least, found = min((error(each), each) for each in candidates)
+        if math.isinf(least):
+            raise IdentifyError(f"{_FOLDS - 1} of {_FOLDS} pulses do not determine the machine: they are too few")
+        return found
+
     by_angle, by_current = problem.fit.smoothness
-    by_angle = min(_ANGLE_WEIGHTS, key=lambda weight: error((weight, by_current)))
-    return by_angle, min(_CURRENT_WEIGHTS, key=lambda weight: error((by_angle, weight)))
+    by_angle, _ = best([(weight, by_current) for weight in _ANGLE_WEIGHTS])
+    return best([(by_angle, weight) for weight in _CURRENT_WEIGHTS])
 
 
 def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:

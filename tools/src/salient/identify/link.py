@@ -1,7 +1,8 @@
 """Experiments of a drive over a session, and their record, which XCP sends while they last.
 
 A record of a control period has current and voltage of the phase of the experiment, angle and switches: each period of
-a pulse, and one in a millisecond between (firmware/control/identify.h). A lost record is an error, never a gap.
+a pulse, and one in a millisecond between (firmware/control/identify.h). Lost records are an error: those that the drive
+has no room for, those of which one frame has come, and a gap that is longer than the drive's pauses.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ _TIMESTAMP = 0x10
 _ANGLE_BITS, _NUMBER_MASK = 20, 15
 _STEP_NS = 500_000
 _KEEP_ALIVE_NS = 4_000_000_000
+_GAP_US = 1500
+"""Time between two records beyond which one is missing: an idle drive has one in a millisecond."""
 _ANSWER_NS = 50_000_000
 """Longest time to the first record of an experiment."""
 
@@ -93,6 +96,7 @@ class Link:
             master.setDaqPtr(0, odt, 0)
             master.writeDaq(0xFF, 4, 0, address)
         master.setDaqListMode(_TIMESTAMP, 0, _EVENT_IDENTIFY, 1, 0)
+        self._session.log.clear()  # it may have records of another client's stream
         master.startStopDaqList(1, 0)
 
     def _member(self, path: str) -> int:
@@ -118,22 +122,26 @@ class Link:
             raise IdentifyError(f"the drive has ended the experiments by the fault {drive.fault}")
         limit = self._member("identify.limit")
         if limit:
-            raise IdentifyError(f"the drive has ended the experiments: {LIMITS[limit]}")
+            reason = LIMITS[limit] if limit < len(LIMITS) else f"its limit {limit}, which these tools do not know"
+            raise IdentifyError(f"the drive has ended the experiments: {reason}")
         lost = self._member("sampler.lost")
         if lost:
             raise IdentifyError(f"{lost} records were lost: the bus has no room for them")
 
     def _take(self) -> np.ndarray:
-        """Records that have come since the last call; the session's log is emptied."""
+        """Records that have come since the last call; the session's log is emptied. IdentifyError: one is missing."""
         frames = [bytes(frame.data) for _, frame in self._session.log
-                  if frame.arbitration_id == self._response_id and len(frame.data) and frame.data[0] < 2]
+                  if frame.arbitration_id == self._response_id and not frame.is_extended_id
+                  and len(frame.data) and frame.data[0] < 2]
         self._session.log.clear()
         self._session.sent.clear()
         raw = bytearray()
         for frame in frames:
-            if frame[0] == 0:
+            if (frame[0] == 0) != (self._pending is None):
+                raise self._missing("a frame of a record")
+            if self._pending is None:
                 self._pending = frame[1:7]
-            elif self._pending is not None:
+            else:
                 raw += self._pending + frame[1:5]
                 self._pending = None
         if not raw:
@@ -141,10 +149,18 @@ class Link:
         words = np.frombuffer(bytes(raw), np.dtype([("time", "<u2"), ("first", "<u4"), ("second", "<u4")]))
         return self._decoded(words)
 
+    def _missing(self, what: str) -> IdentifyError:
+        """The error of records that do not fit together. IdentifyError: see check_limits; the drive has a reason."""
+        self.check_limits()
+        return IdentifyError(f"{what} is missing at {self.time_s:.3f} s: the bus had no room for it, or this computer "
+                             "has not taken it in time")
+
     def _decoded(self, words: np.ndarray) -> np.ndarray:
         out = np.zeros(len(words), RECORD)
         times_us = np.concatenate([[self._time_us & 0xFFFF], words["time"].astype(np.int64)])
         steps = np.mod(np.diff(times_us), 65536)
+        if (steps[0 if self._parts else 1:] > _GAP_US).any():
+            raise self._missing("a record")
         out["time_us"] = self._time_us + np.cumsum(steps)
         second = words["second"]
         angle = (second >> 12).astype(np.int64)
@@ -219,11 +235,11 @@ def linked(session: Session) -> Iterator[Link]:
         drive.begin_experiment(Experiment("rest"))
         deadline_s = session.time_s + 1.0
         while drive.state != "run":
-            link.check_limits()
             if session.time_s > deadline_s or drive.state == "fault":
                 raise IdentifyError(f"the drive does not begin: state {drive.state}, fault {drive.fault}"
                                     f"{'; ' + drive.hindrance if drive.hindrance else ''}")
             session.run_for(1e-3)
+        link.check_limits()  # not before: until a run begins, the drive has the limit of the one before
         yield link
 
 

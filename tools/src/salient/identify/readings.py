@@ -43,6 +43,8 @@ def inductance_of(log: np.ndarray, small_A: float = math.inf) -> list[tuple[floa
     """Angle of the encoder, rev, and inductance, H, by the first rise of the current in a pulse; none without a rise.
     small_A: current up to which the rotor stands, and the iron is not saturated."""
     on = log["action"] == ON
+    if not on.any():
+        return []
     first = int(on.argmax())
     end = first + int((~on[first:]).argmax())  # the record at which both switches are no longer on
     if end == first:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from salient.identify.link import FREEWHEELS
-from salient.identify.result import NOT_OBSERVABLE, Result
+from salient.identify.result import INTERVAL, NOT_OBSERVABLE, Result
 from salient.machine.file import Machine
 from salient.pages import Plot, write_page
 
 _CURVES = 7
-_INTERVAL = 1.96
 
 
 def write_report(result: Result, identified: Machine, plate: Machine, path: Path) -> None:
@@ -67,7 +66,7 @@ def _maps(result: Result) -> Plot:
         for axes, value, deviation in ((left, result.flux_Wb, result.flux_deviation),
                                        (right, result.torque_Nm, result.torque_deviation)):
             line, = axes.plot(angle_deg, value[:, column], linewidth=1, label=label)
-            band = 10.0 * _INTERVAL * deviation[:, column]
+            band = 10.0 * INTERVAL * deviation[:, column]
             axes.fill_between(angle_deg, value[:, column] - band, value[:, column] + band, alpha=0.3,
                               color=line.get_color(), linewidth=0)
     for axes, label in ((left, "flux linkage, Wb"), (right, "torque of a phase, N m")):

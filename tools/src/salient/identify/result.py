@@ -1,14 +1,15 @@
 """The machine that the experiments show, with the uncertainty of each quantity and a verdict on it; and its file.
 
 Intervals are of 95 %, by resampling whole pulses (salient.identify.fit.resampled) or runs of windows (shaft). The
-map's also have the difference to a rougher fit. They do not hold what no pulse shows.
+map's also have the difference to a rougher fit. They do not hold what no pulse shows. How many hold the truth:
+salient.experiments.identified_intervals.
 """
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import math
-import re
 import shutil
 import tempfile
 import tomllib
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from salient.identify import fit as electrical
 from salient.identify.fit import Fit
@@ -30,7 +32,12 @@ from salient.machine.flux_map import ANGLE_INTERVALS, CURRENT_INTERVALS
 from salient.machine.scaling import scaling_of
 
 SAMPLES = 16
-_INTERVAL = 1.96
+INTERVAL = 2.131
+"""Half width of an interval of 95 % by the standard deviation of SAMPLES values: Student's t with 15 degrees."""
+_NEIGHBOURS = (12, 5)
+"""Parts of the angles and of the currents of a map within which points are neighbours."""
+_NORMAL = 1.96
+"""Likewise of the many samples of the shaft, and of what a map's smoothness hides."""
 MAP_ANGLES, MAP_CURRENTS = ANGLE_INTERVALS + 1, CURRENT_INTERVALS
 """Points of the map in the file: angles and currents of the loader's grid, whose points are met exactly."""
 _REST_FLUX = 1e-6
@@ -115,16 +122,30 @@ def result_of(found: Findings, log: np.ndarray, limit_A: float, samples: int = S
                                  np.linspace(0.0, largest_A, MAP_CURRENTS + 1)[1:], indexing="ij")
     raw, torque = fit.flux_Wb(angle, current), fit.torque_Nm(angle, current)
     flux = rising(raw)
-    flux_deviation = np.hypot(np.std([other.flux_Wb(angle, current) for other in others], axis=0),
-                              rough.flux_Wb(angle, current) - raw)
-    torque_deviation = np.hypot(np.std([other.torque_Nm(angle, current) for other in others], axis=0),
-                                rough.torque_Nm(angle, current) - torque)
+    flux_deviation = map_deviation([other.flux_Wb(angle, current) for other in others], raw,
+                                   rough.flux_Wb(angle, current))
+    torque_deviation = map_deviation([other.torque_Nm(angle, current) for other in others], torque,
+                                     rough.torque_Nm(angle, current))
     quiet = log[log["time_us"] < log["time_us"][0] + 20_000]
     maps = _Maps(flux, flux_deviation, torque, torque_deviation)
     return Result(found, fit, shaft, rows, log, limit_A, float(np.median(quiet["dc_link_V"])), angle, current, flux,
                   flux_deviation, torque, torque_deviation, float(np.abs(flux - raw).max()),
                   _quantities(found, fit, others, shaft, maps),
                   _warnings(found, fit))
+
+
+def deviation_of(samples: Sequence[Any]) -> np.ndarray:
+    """Standard deviation of resampled values, about their own mean."""
+    return np.asarray(np.std(np.asarray(samples, float), axis=0, ddof=1))
+
+
+def map_deviation(samples: Sequence[np.ndarray], of: np.ndarray, rougher: np.ndarray) -> np.ndarray:
+    """Deviation of the points of a map: of resampled ones, and the difference to a rougher one, for what the smoothness
+    hides. That is no scatter, so that both add up, and it has a sign: its size is the neighbours', by the
+    mean of squares, not where it happens to be 0."""
+    near = tuple(max(1, points // parts) for points, parts in zip(of.shape, _NEIGHBOURS, strict=True))
+    hidden = np.sqrt(ndimage.uniform_filter((rougher - of) ** 2, near, mode="nearest"))
+    return np.asarray(deviation_of(samples) + _NORMAL / INTERVAL * hidden)
 
 
 def rising(flux_Wb: np.ndarray) -> np.ndarray:
@@ -153,24 +174,24 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
     flux_deviation, torque_deviation = maps.flux_deviation, maps.torque_deviation
 
     def half(values: Any) -> float:
-        return _INTERVAL * float(np.std(list(values)))
+        return INTERVAL * float(deviation_of(list(values)))
 
     resistance = half(other.resistance_ohm for other in others)
     conductance = half(other.conductance_S for other in others)
-    inertia = math.hypot(_INTERVAL * shaft.inertia[1], _MODEL_PART * shaft.inertia[0])
-    friction = math.hypot(_INTERVAL * shaft.friction[1], _MODEL_PART * shaft.friction[0])
+    inertia = math.hypot(_NORMAL * shaft.inertia[1], _MODEL_PART * shaft.inertia[0])
+    friction = math.hypot(_NORMAL * shaft.friction[1], _MODEL_PART * shaft.friction[0])
     angle_deg = max(half(math.degrees(other.delta_rad[row]) for other in others) for row in range(len(found.phases)))
     aligned_deg = math.degrees(2.0 * math.pi * found.position[found.phases[0]] + fit.delta_rad[0])
     largest, strongest = float(flux.max()), float(np.abs(torque).max())
-    rms = _INTERVAL * float(np.sqrt(np.mean(flux_deviation**2))) / largest
-    torque_rms = _INTERVAL * float(np.sqrt(np.mean(torque_deviation**2))) / strongest
+    rms = INTERVAL * float(np.sqrt(np.mean(flux_deviation**2))) / largest
+    torque_rms = INTERVAL * float(np.sqrt(np.mean(torque_deviation**2))) / strongest
     eccentricity = math.degrees(math.hypot(*fit.eccentricity_rad))
     return [
         Quantity("largest flux linkage", "Wb", largest, rms * largest, _verdict(rms, _FLAT_FLUX)),
         Quantity("largest torque of a phase", "N m", strongest, torque_rms * strongest,
                  _verdict(torque_rms, 4.0 * _FLAT_FLUX)),
         Quantity("resistance of winding and devices", "ohm", fit.resistance_ohm, resistance,
-                 _verdict(resistance / fit.resistance_ohm, _FLAT_RESISTANCE)),
+                 _verdict(resistance / max(fit.resistance_ohm, 1e-12), _FLAT_RESISTANCE)),
         Quantity("mean drop of a device", "V", fit.drop_V, half(other.drop_V for other in others), "determined"),
         Quantity("encoder at the aligned position of phase a", "deg", aligned_deg % (360.0 / found.rotor_poles),
                  angle_deg, _verdict(angle_deg, _FLAT_ANGLE_DEG)),
@@ -183,9 +204,9 @@ def _quantities(found: Findings, fit: Fit, others: Sequence[Fit], shaft: Shaft, 
         Quantity("inertia", "kg m^2", shaft.inertia[0], inertia, _verdict(inertia / shaft.inertia[0], _FLAT_INERTIA)),
         Quantity("viscous friction", "N m s", shaft.friction[0], friction,
                  _verdict(friction / max(abs(shaft.friction[0]), 1e-12), 0.1)),
-        Quantity("Coulomb friction", "N m", shaft.coulomb[0], _INTERVAL * shaft.coulomb[1],
+        Quantity("Coulomb friction", "N m", shaft.coulomb[0], _NORMAL * shaft.coulomb[1],
                  "no key of a machine file" if shaft.coulomb[0] else "within its uncertainty"),
-        Quantity("constant load", "N m", shaft.load[0], _INTERVAL * shaft.load[1],
+        Quantity("constant load", "N m", shaft.load[0], _NORMAL * shaft.load[1],
                  "no key of a machine file" if shaft.load[0] else "within its uncertainty"),
     ]
 
@@ -224,7 +245,7 @@ def write_machine(result: Result, plate: Path, path: Path,
     board = {"adc_current_A": data.adc_current_A, "adc_voltage_V": data.adc_voltage_V}
     of_plate = tomllib.loads(plate.read_text(encoding="utf-8-sig"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(f"{_staging(path)}*"):
+    for left in path.parent.glob(f"{glob.escape(_staging(path))}*"):
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=_staging(path)) as folder:
         staged = Path(folder) / path.name
@@ -248,10 +269,19 @@ def write_machine(result: Result, plate: Path, path: Path,
         staged.replace(path)
         if staged.with_suffix(".html").exists():
             staged.with_suffix(".html").replace(path.with_suffix(".html"))
-    for other in path.parent.glob(f"{path.stem}_*.csv"):
-        if other != table and re.fullmatch(f"[0-9a-f]{{{_DIGEST}}}", other.stem.removeprefix(f"{path.stem}_")):
+    for other in _earlier_maps(path):
+        if other != table:
             other.unlink(missing_ok=True)
     return load_machine(path)
+
+
+def _earlier_maps(path: Path) -> list[Path]:
+    """Maps of earlier identifications into a machine file: their name has the digest of their content, and no other
+    file beside them, as a copy that has become the next name plate, names them."""
+    others = [each.read_bytes() for each in path.parent.glob("*.toml") if each.name != path.name]
+    return [each for each in path.parent.glob(f"{glob.escape(path.stem)}_*.csv")
+            if each.stem == f"{path.stem}_{hashlib.sha256(each.read_bytes()).hexdigest()[:_DIGEST]}"
+            and not any(each.name.encode() in other for other in others)]
 
 
 def _staging(path: Path) -> str:

@@ -67,6 +67,8 @@ _REFINED = 6
 """Pulses of a phase that show where it is aligned, at least."""
 _PLACES = 24
 """Places in an electrical period whose mean inductances count alike."""
+_SPREAD = 0.1
+"""Least singular value of a harmonic at such places by the root of their number: 0.7 of an even spread."""
 _LEAST_SALIENCY = 0.2
 """Amplitude of the inductance by its mean, below which it does not vary with the angle."""
 
@@ -284,6 +286,9 @@ class Sequence:
         angle = np.array([np.angle(np.exp(2j * math.pi * self.found.rotor_poles * turn[place == each]).mean())
                           for each in known])
         design = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+        if len(known) < 3 or np.linalg.svd(design, compute_uv=False)[-1] < _SPREAD * math.sqrt(len(known)):
+            raise IdentifyError(f"phase {'abcdef'[phase]}: all its pulses are near the same angle, which does not show "
+                                "where its inductance is largest")
         mean, cosine, sine = np.linalg.lstsq(design, inductance, rcond=None)[0]
         if math.hypot(cosine, sine) < _LEAST_SALIENCY * mean:
             raise IdentifyError(f"phase {'abcdef'[phase]}: its inductance does not vary with the angle of "

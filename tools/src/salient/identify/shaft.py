@@ -61,7 +61,10 @@ def _of_the_iron(fit: Fit, log: np.ndarray) -> np.ndarray:
 
 def shaft_of(found: Findings, fit: Fit, log: np.ndarray) -> Shaft:
     """Inertia and friction by the records after the alignment. IdentifyError: the rotor has not turned enough."""
-    log = _of_the_iron(fit, log[log["time_us"] > found.wired_us])
+    log = log[log["time_us"] > found.wired_us]
+    if len(log) < 2:
+        raise IdentifyError("no record of the turning rotor for its inertia")
+    log = _of_the_iron(fit, log)
     time_s = (log["time_us"] - log["time_us"][0]) * 1e-6
     angle = fit.shaft_rad(2.0 * math.pi * log["turn"])
     # Impulse of the torque between two records, by Simpson's rule, at their mean time.
@@ -119,10 +122,12 @@ def _solved(rows: np.ndarray, right: np.ndarray) -> Shaft:
     if values[0] <= _SIGNIFICANT * deviations[0]:
         raise IdentifyError("the rotor does not follow the torque of the pulses: blocked, or another motor drives it")
     inertia = 1.0 / float(values[0])
-    scaled, scattered = values * inertia, samples / samples[:, :1]
+    scaled = values * inertia
+    # Deviations of the quotients to the first order: a sample may have drawn no torque at all, or a negative 1/J.
+    scattered = (samples - scaled * samples[:, :1]) * inertia
     found = {column: (float(scaled[k]), float(scattered[:, k].std())) for k, column in enumerate(columns)}
     none = (0.0, 0.0)
-    return Shaft((inertia, float((1.0 / samples[:, 0]).std())), found[1], found.get(2, none), found.get(3, none))
+    return Shaft((inertia, float(deviations[0]) * inertia**2), found[1], found.get(2, none), found.get(3, none))
 
 
 def _resampled(rows: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
