@@ -47,7 +47,7 @@ class Motor:
     eccentricity_rad: tuple[float, float] = (6e-4, -4e-4)
     delay_s: float = 2e-6
     offset_A: tuple[float, ...] = (0.02, -0.03, 0.01)
-    """Current of the motor by that of its sensor."""
+    """Current of the motor when its sensor reads none."""
     rises: tuple[float, float] = field(default=(0.15, 0.75))
     """Ends of the trapezoid's slope, of half an electrical period."""
 
@@ -56,7 +56,7 @@ class Motor:
         electrical_rad = self.rotor_poles * np.asarray(angle_rad, float)
         if not self.corners:
             if derivative:
-                return -self.rotor_poles * np.sin(electrical_rad) / 2.0
+                return np.asarray(-self.rotor_poles * np.sin(electrical_rad) / 2.0)
             return np.asarray((1.0 + np.cos(electrical_rad)) / 2.0)
         folded = np.abs(np.mod(electrical_rad + math.pi, 2.0 * math.pi) - math.pi) / math.pi
         begin, end = self.rises

@@ -1,8 +1,8 @@
 """Experiments of a drive over a session, and their record, which XCP sends while they last.
 
 A record of a control period has current and voltage of the phase of the experiment, angle and switches: each period of
-a pulse, and one in a millisecond between (firmware/control/identify.h). Lost records are an error: those that the drive
-has no room for, those of which one frame has come, and a gap that is longer than the drive's pauses.
+a pulse, and one in a millisecond between (firmware/control/identify.h). Lost records are an error: a drive without
+room for one, a record of which one frame has come, and a gap that is longer than the drive's pauses.
 """
 
 from __future__ import annotations
