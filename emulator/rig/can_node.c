@@ -38,12 +38,12 @@ bool can_node_load(can_node_t *node, unsigned mailbox, const hal_can_frame_t *fr
 unsigned can_node_free_mailbox(const can_node_t *node, const hal_can_frame_t *frame) {
     const uint32_t arbitration = can_node_arbitration(frame);
     unsigned lowest = HAL_CAN_MAILBOXES;
-    for (unsigned i = HAL_CAN_MAILBOXES; i-- > 0;) {
+    for (unsigned i = 0; i < HAL_CAN_MAILBOXES; ++i) {
         const can_mailbox_t *mailbox = &node->mailbox[i];
         if (!mailbox->taken) {
-            lowest = i;
+            lowest = lowest < i ? lowest : i;
         } else if (mailbox->arbitration == arbitration) {
-            break;
+            lowest = HAL_CAN_MAILBOXES;
         }
     }
     return lowest;

@@ -27,7 +27,7 @@ COLD thermal_parameters_t thermal_configure(const int32_t *values) {
 }
 
 /* Loads in Q24, below 2^30, times at most 2^30. */
-COLD static void refer(const thermal_model_t *before, const thermal_model_t *now, int64_t *load_q56) {
+COLD static void keep_heat(const thermal_model_t *before, const thermal_model_t *now, int64_t *load_q56) {
     const bool differs = before->inverse_q48 != 0 && before->inverse_q48 != now->inverse_q48;
     for (unsigned phase = 0; differs && phase < HAL_PHASES_MAX; phase++) {
         const int64_t load_q24 = fixed_divide((load_q56[phase] >> 32) * now->inverse_q48, before->inverse_q48);
@@ -36,8 +36,8 @@ COLD static void refer(const thermal_model_t *before, const thermal_model_t *now
 }
 
 COLD void thermal_reconfigure(const thermal_parameters_t *before, const thermal_parameters_t *now, thermal_t *thermal) {
-    refer(&before->winding, &now->winding, thermal->winding_q56);
-    refer(&before->switches, &now->switches, thermal->switches_q56);
+    keep_heat(&before->winding, &now->winding, thermal->winding_q56);
+    keep_heat(&before->switches, &now->switches, thermal->switches_q56);
 }
 
 /* rate * step is at most 2^29 * 2^17, and the difference less than 2^23. */

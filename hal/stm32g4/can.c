@@ -99,11 +99,11 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
 static uint32_t free_buffer(uint32_t word0) {
     const uint32_t pending = FDCAN_TXBRP;
     uint32_t lowest = HAL_CAN_MAILBOXES;
-    for (uint32_t index = HAL_CAN_MAILBOXES; index-- > 0;) {
+    for (uint32_t index = 0; index < HAL_CAN_MAILBOXES; index++) {
         if ((pending & BIT(index)) == 0) {
-            lowest = index;
+            lowest = lowest < index ? lowest : index;
         } else if (ELEMENT(TRANSMIT_BUFFERS, index)[0] == word0) {
-            break;
+            lowest = HAL_CAN_MAILBOXES;
         } else {
             /* another identifier: arbitration decides */
         }

@@ -119,7 +119,6 @@
 #define FLASH_CR_STRT BIT(16)
 #define FLASH_CR_LOCK BIT(31)
 #define FLASH_ECCR REGISTER(FLASH_BASE, 0x18) /* rw 0x0 w1c 0xF0000000 */
-#define FLASH_ECCR_BK_ECC BIT(21)
 #define FLASH_ECCR_ECCC2 BIT(28)
 #define FLASH_ECCR_ECCD2 BIT(29)
 #define FLASH_ECCR_ECCC BIT(30)
@@ -369,8 +368,6 @@
 #define RNG_CR_RNGEN BIT(2)
 #define RNG_SR REGISTER(RNG_BASE, 0x04) /* rw 0x0 w0c 0x60 */
 #define RNG_SR_DRDY BIT(0)
-#define RNG_SR_SECS BIT(2)
-#define RNG_SR_CEIS BIT(5)
 #define RNG_SR_SEIS BIT(6)
 #define RNG_DR REGISTER(RNG_BASE, 0x08) /* r 0x0 */
 

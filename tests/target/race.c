@@ -186,6 +186,10 @@ thermal_parameters_t thermal_configure(const int32_t *values) {
     return (thermal_parameters_t){0};
 }
 
+void thermal_reconfigure(const thermal_parameters_t *before, const thermal_parameters_t *now, thermal_t *thermal) {
+    (void)before, (void)now, (void)thermal;
+}
+
 bool thermal_sample(const thermal_parameters_t *parameters, thermal_t *thermal, const int32_t *current_q9,
                     uint32_t time_us) {
     (void)parameters, (void)thermal, (void)current_q9, (void)time_us;

@@ -1121,6 +1121,20 @@ TEST_F(Drive, an_experiment_begins_after_a_run_that_a_limit_has_ended) {
     }
 }
 
+TEST_F(Drive, the_end_of_an_experiment_withdraws_no_command_but_its_own) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    for (const command_request_t request : {COMMAND_STOP, COMMAND_IDENTIFY}) {
+        drive.identify.begun = true; // between the interrupt that has ended it and the next one
+        drive.identify.state = IDENTIFY_ENDED;
+        drive.comms.commands.arming.armed = true;
+        drive.command.request = request;
+        drive_background(&drive, &hal);
+        EXPECT_EQ(drive.command.request, request == COMMAND_STOP ? COMMAND_STOP : COMMAND_OFF);
+    }
+}
+
 // Torque that would carry the speed beyond the last reference ends at once; towards it, and in torque mode, it ramps.
 // [SR-04]
 TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_in_either_direction) {
