@@ -115,18 +115,20 @@ class Link:
         if self._session.drive.state != "run":
             raise IdentifyError("the drive has ended the experiments: no command reached it for command_timeout_ms")
 
-    def check_limits(self) -> None:
-        """IdentifyError: a limit or a fault has ended the experiments, or records were lost."""
+    def check_limits(self, earlier: int | None = 0) -> int:
+        """The limit that the drive has. IdentifyError: a limit or a fault has ended the experiments, or records were
+        lost. earlier: the limit of the run before, which the drive has until the next one begins; None: any."""
         drive = self._session.drive
         if drive.state == "fault":
             raise IdentifyError(f"the drive has ended the experiments by the fault {drive.fault}")
         limit = self._member("identify.limit")
-        if limit:
+        if limit and earlier is not None and limit != earlier:
             reason = LIMITS[limit] if limit < len(LIMITS) else f"its limit {limit}, which these tools do not know"
             raise IdentifyError(f"the drive has ended the experiments: {reason}")
         lost = self._member("sampler.lost")
         if lost:
             raise IdentifyError(f"{lost} records were lost: the bus has no room for them")
+        return limit
 
     def _take(self) -> np.ndarray:
         """Records that have come since the last call; the session's log is emptied. IdentifyError: one is missing."""
@@ -234,12 +236,14 @@ def linked(session: Session) -> Iterator[Link]:
         link = Link(session, master)
         drive.begin_experiment(Experiment("rest"))
         deadline_s = session.time_s + 1.0
+        earlier: int | None = None
         while drive.state != "run":
+            earlier = link.check_limits(earlier)
             if session.time_s > deadline_s or drive.state == "fault":
+                link.check_limits()
                 raise IdentifyError(f"the drive does not begin: state {drive.state}, fault {drive.fault}"
                                     f"{'; ' + drive.hindrance if drive.hindrance else ''}")
             session.run_for(1e-3)
-        link.check_limits()  # not before: until a run begins, the drive has the limit of the one before
         yield link
 
 
