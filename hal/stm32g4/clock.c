@@ -20,6 +20,7 @@
 #define FDCAN_PCLK 2u
 #define LPTIM_LSE 3u
 #define CLK48_HSI48 0u
+#define ACCESS_TURNS 100u /* without access LSE does not start, which the self-test tells */
 
 void board_wait_us(uint32_t time_us, uint32_t clock_mhz) {
     /* Three cycles or more per turn. */
@@ -67,7 +68,8 @@ static void system_clock(void) {
 /* Starts the crystal LSE, for which time_init waits. */
 static void second_clock(void) {
     PWR_CR1 |= PWR_CR1_DBP;
-    while (!(PWR_CR1 & PWR_CR1_DBP)) { /* RCC is on another bus: the access is there before the write that needs it */
+    for (uint32_t turn = 0; turn < ACCESS_TURNS && !(PWR_CR1 & PWR_CR1_DBP); turn++) {
+        /* RCC is on another bus: the access is there before the write that needs it */
     }
     RCC_BDCR |= RCC_BDCR_LSEON;
 }

@@ -116,7 +116,7 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
     shared = state;
     torn_parameters += torn(parameters, offsetof(control_parameters_t, thermal)); /* what configure_control writes */
     torn_commands += torn(command, sizeof *command);
-    fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts * 0x10001u);
+    fill(SNAPSHOT(state), sizeof(drive_telemetry_t), interrupts); /* without experiments: their bit is 0 */
     exchange(state);
     hide_period(&state->deferred_request);
     return false;
@@ -124,6 +124,8 @@ bool control_step(const control_parameters_t *parameters, control_state_t *state
 
 static_assert(sizeof(uint32_t) + sizeof(drive_telemetry_t) <= offsetof(control_state_t, deferred_request),
               "a snapshot reads only members of control_state_t that nothing else here uses");
+static_assert(offsetof(control_state_t, state_machine.identifies) % sizeof(uint32_t) >= sizeof interrupts,
+              "commands of experiments are their own, which take_command sees to");
 
 /* A step of up to several control periods. */
 void deferred_compute(const control_parameters_t *parameters, control_state_t *state, const command_t *command) {
