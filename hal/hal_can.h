@@ -26,7 +26,7 @@ uint32_t hal_can_receive_overflows(const hal_t *hal);
 
 /* Puts a frame into a free mailbox: the lowest identifier leaves first, and frames of one identifier in their order.
  * Controllers send equal identifiers by number of the mailbox: the frame takes the lowest free one above every other of
- * its identifier. False when there is none, or in bus-off. [background] */
+ * its identifier. False without such a mailbox, and in bus-off. [background] */
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame);
 
 /* Error state (ISO 11898-1): passive above 127 of either counter, bus-off above 255 transmit errors. In bus-off nothing

@@ -101,11 +101,12 @@ void board_reset(board_t *board, hal_reset_cause_t cause) {
     nvm_power_on(&board->nvm);
 }
 
-/* Windings, then switches, of a board for four phases where these suffice. */
+/* Phases for which the board has sensors. */
 static unsigned board_phases(const board_t *board) {
     return board->plant->machine->phases > PHASES_OF_A_BOARD ? HAL_PHASES_MAX : PHASES_OF_A_BOARD;
 }
 
+/* Windings come before switches. */
 static unsigned temperature_sensor(const board_t *board) {
     const unsigned phases = board_phases(board), number = board->temperature_number;
     return number < phases ? HAL_ADC_WINDING + number : HAL_ADC_INVERTER + number - phases;

@@ -51,8 +51,8 @@ void can_node_init(can_node_t *node);
 /* Frees the queue. */
 void can_node_close(can_node_t *node);
 
-/* Number of the lowest free mailbox in which a frame does not overtake one of its arbitration field;
- * HAL_CAN_MAILBOXES when there is none. Of these frames the one in the mailbox of lowest number is sent first. */
+/* Number of the lowest free mailbox in which a frame does not overtake one of its arbitration field, else
+ * HAL_CAN_MAILBOXES. Frames of one field are sent by the number of their mailbox. */
 unsigned can_node_free_mailbox(const can_node_t *node, const hal_can_frame_t *frame);
 
 /* Puts a frame into a mailbox; false when it is taken, or does not exist. */

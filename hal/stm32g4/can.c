@@ -94,7 +94,7 @@ uint32_t hal_can_receive_overflows(const hal_t *hal) {
     return hal->receive_overflows;
 }
 
-/* Lowest free buffer above every frame with this first word, HAL_CAN_MAILBOXES when there is none: buffers of one
+/* Lowest free buffer above every frame with this first word, HAL_CAN_MAILBOXES where all are taken: buffers of one
  * identifier leave in the order of their numbers, not of their requests (RM0440, FDCAN: Tx queue). */
 static uint32_t free_buffer(uint32_t word0) {
     const uint32_t pending = FDCAN_TXBRP;

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-import time
+import threading
+from typing import Any
 
 import can
 
@@ -41,19 +42,43 @@ class AnsweringSession:
         self._due = []
 
 
+class StoppedClock:
+    """pyXCP's clock, which is `stopped_ns` ahead; `read` by the thread that waits for a response."""
+
+    def __init__(self, clock: Any) -> None:
+        self._clock = clock
+        self.stopped_ns = 0
+        self.read = threading.Event()
+
+    @property
+    def value(self) -> int:
+        now_ns = int(self._clock.value) + self.stopped_ns
+        self.read.set()
+        return now_ns
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._clock, name)
+
+
 def test_a_client_that_was_stopped_takes_no_answer_for_another_one(monkeypatch):
     """pyXCP's thread does not run for longer than its own timeout, as of a process that is stopped."""
     stalls_s = [0.0]
     receive = xcp.SessionInterface.recv
+    clocks: list[StoppedClock] = []
 
     def stalled(self, timeout=None):
         message = receive(self, timeout)
-        if message is not None:
-            time.sleep(stalls_s.pop() if stalls_s else 0.0)
+        if message is not None and stalls_s and (stall_s := stalls_s.pop()):
+            [clock] = clocks
+            clock.stopped_ns += round(stall_s * 1e9)
+            clock.read.clear()
+            assert clock.read.wait(60.0), "no thread waits for the response"
         return message
 
     monkeypatch.setattr(xcp.SessionInterface, "recv", stalled)
     with xcp.connected(AnsweringSession()) as master:
         assert [bytes(master.shortUpload(1, address)) for address in (1, 2)] == [b"\x01", b"\x02"]
+        clocks.append(StoppedClock(master.transport.timestamp))
+        master.transport.timestamp = clocks[0]
         stalls_s.append(STALL_S)
         assert [bytes(master.shortUpload(1, address)) for address in range(3, 8)] == [bytes([k]) for k in range(3, 8)]
