@@ -23,7 +23,7 @@
 
 #include "hal.h"
 
-#define HAL_NVM_PAGES 6
+#define HAL_NVM_PAGES 16
 #define HAL_NVM_PAGE_WORDS 256 /* of 64 bits; a port with larger pages offers the first words of each */
 
 /* Content of an erased word. */

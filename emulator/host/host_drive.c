@@ -24,9 +24,16 @@ static void background(void *context) {
     drive_background(&host->drive, &host->hal);
 }
 
+/* As the start of a port does. */
+static bool start(host_drive_t *host) {
+    if (host->config.stored_tables) {
+        table_store_load(&host->hal, host->config.control_rate_hz, &host->built_in, &machine_tables);
+    }
+    return drive_init(&host->drive, &host->hal, &host->config);
+}
+
 static void restart(void *context) {
-    host_drive_t *host = context;
-    drive_init(&host->drive, &host->hal, &host->config); /* with the configuration of the start, which it accepted */
+    start(context); /* with the configuration of the start, which it accepted */
 }
 
 static void flip(void *context, memory_object_t object, uint32_t bit) {
@@ -40,12 +47,14 @@ drive_config_t host_drive_config(const options_t *options, unsigned number) {
         .node = options->node + number,
         .telemetry_period_ms = options->telemetry_period_ms,
         .canopen_node = options->protocol_index == OPTIONS_PROTOCOL_CANOPEN ? options->node + number + 1u : 0,
+        .stored_tables = options->memory != NULL && options->drives == 1,
     };
 }
 
 bool host_drive_start(host_drive_t *host, board_t *board, const drive_config_t *config, rig_firmware_t *firmware) {
     host->hal.board = board;
     host->config = *config;
+    host->built_in = machine_tables;
     *firmware = (rig_firmware_t){.control_interrupt = control_interrupt,
                                  .deferred_interrupt = deferred_interrupt,
                                  .background = background,
@@ -53,5 +62,5 @@ bool host_drive_start(host_drive_t *host, board_t *board, const drive_config_t *
                                  .flip = flip,
                                  .flip_objects = MEMORY_FLIP_OBJECTS,
                                  .context = host};
-    return drive_init(&host->drive, &host->hal, &host->config);
+    return start(host);
 }

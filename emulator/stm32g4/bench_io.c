@@ -59,13 +59,25 @@ static void set_currents(double volts_of_tripped) {
     analog_refresh();
 }
 
+static void set_sto(bool first, bool second) {
+    set(wiring.sto[0], first);
+    set(wiring.sto[1], second);
+    set(wiring.breaks[0], first && second);
+    set(wiring.breaks[1], first && second);
+}
+
+/* The bench moves its lines at any time, and the model looks at them once a period: the board keeps a fall of which the
+ * line has risen again. */
+static void sto_lines(void) {
+    const uint32_t fallen = board->break_causes;
+    board->break_causes &= ~(HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2);
+    set_sto(!(fallen & HAL_PWM_BREAK_STO_1), !(fallen & HAL_PWM_BREAK_STO_2));
+    set_sto(board->sto_energised[0], board->sto_energised[1]);
+}
+
 void bench_io_lines(void) {
-    const bool energised = board->sto_energised[0] && board->sto_energised[1];
-    set(wiring.sto[0], board->sto_energised[0]);
-    set(wiring.sto[1], board->sto_energised[1]);
+    sto_lines();
     set(wiring.driver_fault, true);
-    set(wiring.breaks[0], energised);
-    set(wiring.breaks[1], energised);
     if (board->plant->tripped) { /* the plant has opened the switches; a comparator has no memory */
         set_currents(VREF_V);
         plant_clear_trip(board->plant);

@@ -100,10 +100,16 @@ static void flush(comms_t *comms, hal_t *hal, uint32_t time_us) {
     }
 }
 
-/* Frames of XCP that are no response to a single command: an upload's wait with the responses, a
+/* Frames of XCP that are no response at once to a single command: an upload's wait with the responses, a
  * measurement's are for a bus on which the drive has nothing else to send. */
-COLD static void send_xcp(comms_t *comms, hal_t *hal, const parameters_t *parameters) {
+COLD static void send_xcp(comms_t *comms, hal_t *hal, const comms_objects_t *objects) {
+    const parameters_t *parameters = objects->parameters;
     hal_can_frame_t frame;
+    if (comms->xcp.pending && frame_queue_free(&comms->responses) > 0 &&
+        xcp_late_response(&comms->xcp, objects->tables, &frame)) {
+        frame.identifier += comms->telemetry.identifier_offset;
+        frame_queue_push(&comms->responses, &frame);
+    }
     while (comms->xcp.upload_left > 0 && frame_queue_free(&comms->responses) > 1u &&
            xcp_next_frame(&comms->xcp, parameters, true, &frame)) {
         frame.identifier += comms->telemetry.identifier_offset;
@@ -157,7 +163,8 @@ static void receive_xcp(comms_t *comms, hal_t *hal, const comms_objects_t *objec
         counter_add(&comms->telemetry.dropped, 1);
         return;
     }
-    const xcp_context_t context = {objects->parameters, &objects->conditions, &comms->set, objects->store};
+    const xcp_context_t context = {objects->parameters, &objects->conditions, &comms->set, objects->store,
+                                   objects->tables};
     hal_can_frame_t response;
     if (xcp_receive(&comms->xcp, hal, frame, &context, time_us, &response)) {
         response.identifier += comms->telemetry.identifier_offset;
@@ -236,7 +243,7 @@ bool comms_background(comms_t *comms, hal_t *hal, const comms_objects_t *objects
                          (unsigned)parameters->values[PARAMETER_TELEMETRY_SLOW_PERIOD_MS]);
     const bool commanded = receive(comms, hal, objects, timeout_us, time_us);
     flush(comms, hal, time_us);
-    send_xcp(comms, hal, parameters);
+    send_xcp(comms, hal, objects);
     return commanded;
 }
 

@@ -63,6 +63,7 @@ typedef struct {
     const fault_trace_t *trace;
     const self_test_t *self_test;
     const control_parameters_t *control_parameters;
+    table_store_t *tables; /* NULL: the port does not load them */
 } comms_objects_t;
 
 /* The first telemetry cycle is due at time_us. node: 0..NODE_MAX. */

@@ -4,6 +4,7 @@
 #include "comms/xcp_code.h"
 #include "comms/xcp_daq.h"
 #include "comms/xcp_memory.h"
+#include "comms/xcp_program.h"
 #include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "fixed/fixed.h"
@@ -14,7 +15,6 @@ enum { RESPONSE = 0xFF, ERROR = 0xFE };
 enum { ID_TEXT = 0, ID_FILE_NAME = 1, ID_EPK = 5 };
 enum { MESSAGE_BYTES = 8, DATA_BYTES = MESSAGE_BYTES - 1, DOWNLOAD_BYTES = MESSAGE_BYTES - 2, KEY_BYTES = 4 };
 
-#define RESOURCES (XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ)
 #define COMM_MODE 0xC0u     /* low byte first, addresses of bytes, UPLOAD in blocks, more by GET_COMM_MODE_INFO */
 #define PROTOCOL_VERSION 1u /* of protocol and transport layer */
 #define STORE_CAL 0x01u
@@ -29,6 +29,10 @@ typedef struct {
 /* Bytes of a command without data and keys of a count of its own; 0: one. Codes are unique in their lower six bits. */
 #define COMMAND_INDEX 0x3F
 static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
+    [PROGRAM_RESET & COMMAND_INDEX] = 1,
+    [PROGRAM & COMMAND_INDEX] = 2,
+    [PROGRAM_CLEAR & COMMAND_INDEX] = 8,
+    [PROGRAM_START & COMMAND_INDEX] = 1,
     [ALLOC_ODT_ENTRY & COMMAND_INDEX] = 6,
     [ALLOC_ODT & COMMAND_INDEX] = 5,
     [ALLOC_DAQ & COMMAND_INDEX] = 4,
@@ -52,8 +56,8 @@ static const uint8_t least_bytes[COMMAND_INDEX + 1] = {
 };
 
 static bool is_whole(const uint8_t *command, unsigned bytes) {
-    const bool counted = command[0] == DOWNLOAD || command[0] == UNLOCK;
-    const unsigned least = command[0] < ALLOC_ODT_ENTRY ? 0 : least_bytes[command[0] & COMMAND_INDEX];
+    const bool counted = command[0] == DOWNLOAD || command[0] == UNLOCK || command[0] == PROGRAM;
+    const unsigned least = command[0] < PROGRAM_RESET ? 0 : least_bytes[command[0] & COMMAND_INDEX];
     return bytes >= least + (counted ? fixed_min_u32(command[1], DOWNLOAD_BYTES) : 0);
 }
 
@@ -96,6 +100,14 @@ static void end_session(xcp_t *xcp) {
     xcp->unlocked = 0;
     xcp->seed = 0;
     xcp->upload_left = 0;
+    xcp->programming = false;
+    xcp->pending = false;
+}
+
+/* That can be unlocked. */
+static uint8_t resources_of(const xcp_context_t *context) {
+    const uint8_t always = XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ;
+    return context->tables != NULL ? always | XCP_RESOURCE_PROGRAMMING : always;
 }
 
 static void respond(message_t *response, const uint8_t *bytes, uint8_t count) {
@@ -105,17 +117,19 @@ static void respond(message_t *response, const uint8_t *bytes, uint8_t count) {
     response->length = (uint8_t)(1 + count);
 }
 
-static xcp_error_t connect(xcp_t *xcp, message_t *response) {
+static xcp_error_t connect(xcp_t *xcp, const xcp_context_t *context, message_t *response) {
     end_session(xcp);
     xcp->connected = true;
-    const uint8_t bytes[] = {RESOURCES, COMM_MODE, MESSAGE_BYTES, MESSAGE_BYTES, 0, PROTOCOL_VERSION, PROTOCOL_VERSION};
+    const uint8_t bytes[] = {resources_of(context), COMM_MODE,        MESSAGE_BYTES,   MESSAGE_BYTES, 0,
+                             PROTOCOL_VERSION,      PROTOCOL_VERSION};
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;
 }
 
-static xcp_error_t get_status(const xcp_t *xcp, const nvm_store_t *store, message_t *response) {
-    const unsigned status = (xcp->daq.running ? STATUS_DAQ : 0) | (store->saving == NVM_STORE_SAVING ? STORE_CAL : 0);
-    const uint8_t bytes[] = {(uint8_t)status, (uint8_t)(RESOURCES & ~xcp->unlocked), 0, 0, 0};
+static xcp_error_t get_status(const xcp_t *xcp, const xcp_context_t *context, message_t *response) {
+    const bool saving = context->store->saving == NVM_STORE_SAVING;
+    const unsigned status = (xcp->daq.running ? STATUS_DAQ : 0) | (saving ? STORE_CAL : 0);
+    const uint8_t bytes[] = {(uint8_t)status, (uint8_t)(resources_of(context) & ~xcp->unlocked), 0, 0, 0};
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;
 }
@@ -129,8 +143,9 @@ static xcp_error_t get_id(xcp_t *xcp, const uint8_t *command, message_t *respons
     return XCP_ERROR_NONE;
 }
 
-static xcp_error_t get_seed(xcp_t *xcp, hal_t *hal, const uint8_t *command, uint32_t time_us, message_t *response) {
-    if (command[1] != 0 || (command[2] & RESOURCES) == 0 || (command[2] & (command[2] - 1u)) != 0) {
+static xcp_error_t get_seed(xcp_t *xcp, hal_t *hal, const xcp_context_t *context, const uint8_t *command,
+                            uint32_t time_us, message_t *response) {
+    if (command[1] != 0 || (command[2] & resources_of(context)) == 0 || (command[2] & (command[2] - 1u)) != 0) {
         return XCP_ERROR_OUT_OF_RANGE;
     }
     uint8_t bytes[1 + KEY_BYTES] = {0}; /* 0: it is unlocked */
@@ -146,7 +161,8 @@ static xcp_error_t get_seed(xcp_t *xcp, hal_t *hal, const uint8_t *command, uint
     return XCP_ERROR_NONE;
 }
 
-static xcp_error_t unlock(xcp_t *xcp, const uint8_t *command, uint32_t time_us, message_t *response) {
+static xcp_error_t unlock(xcp_t *xcp, const xcp_context_t *context, const uint8_t *command, uint32_t time_us,
+                          message_t *response) {
     const uint32_t seed = xcp->seed;
     xcp->seed = 0;
     if (seed == 0) {
@@ -158,7 +174,7 @@ static xcp_error_t unlock(xcp_t *xcp, const uint8_t *command, uint32_t time_us, 
         return XCP_ERROR_ACCESS_LOCKED;
     }
     xcp->unlocked |= xcp->seed_resource;
-    const uint8_t locked = (uint8_t)(RESOURCES & ~xcp->unlocked);
+    const uint8_t locked = (uint8_t)(resources_of(context) & ~xcp->unlocked);
     respond(response, &locked, 1);
     return XCP_ERROR_NONE;
 }
@@ -220,6 +236,22 @@ static xcp_error_t short_upload(xcp_t *xcp, const parameters_t *parameters, cons
     return upload(xcp, parameters, command[1], response);
 }
 
+/* Commands of the groups PGM and DAQ. */
+static xcp_error_t execute_optional(xcp_t *xcp, const hal_t *hal, const uint8_t *command, const xcp_context_t *context,
+                                    message_t *response) {
+    if (command[0] < PROGRAM_RESET || command[0] >= ALLOC_ODT_ENTRY) {
+        return xcp_daq_command(xcp, command, response->data, &response->length);
+    }
+    if (context->tables == NULL) {
+        return XCP_ERROR_UNKNOWN;
+    }
+    if (command[0] == PROGRAM_RESET) {
+        end_session(xcp);
+        return XCP_ERROR_NONE;
+    }
+    return xcp_program_command(xcp, hal, context, command, response->data, &response->length);
+}
+
 static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsigned bytes, const xcp_context_t *context,
                            uint32_t time_us, message_t *response) {
     if (!is_whole(command, bytes)) {
@@ -227,12 +259,12 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsig
     }
     switch (command[0]) {
     case CONNECT:
-        return connect(xcp, response);
+        return connect(xcp, context, response);
     case DISCONNECT:
         end_session(xcp);
         return XCP_ERROR_NONE;
     case GET_STATUS:
-        return get_status(xcp, context->store, response);
+        return get_status(xcp, context, response);
     case SYNCH:
         return XCP_ERROR_SYNCHRONISED;
     case GET_COMM_MODE_INFO:
@@ -244,9 +276,9 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsig
     case SET_REQUEST:
         return set_request(xcp, context, command);
     case GET_SEED:
-        return get_seed(xcp, hal, command, time_us, response);
+        return get_seed(xcp, hal, context, command, time_us, response);
     case UNLOCK:
-        return unlock(xcp, command, time_us, response);
+        return unlock(xcp, context, command, time_us, response);
     case SET_MTA:
         return set_address(xcp, command);
     case UPLOAD:
@@ -256,8 +288,31 @@ static xcp_error_t execute(xcp_t *xcp, hal_t *hal, const uint8_t *command, unsig
     case DOWNLOAD:
         return download(xcp, context, command);
     default:
-        return xcp_daq_command(xcp, command, response->data, &response->length);
+        return execute_optional(xcp, hal, command, context, response);
     }
+}
+
+/* While a command waits for the memory: those that end the session or ask for nothing. */
+static bool interrupts_programming(uint8_t code) {
+    return code == CONNECT || code == DISCONNECT || code == SYNCH;
+}
+
+static void write_response(hal_can_frame_t *frame, const message_t *response, xcp_error_t error) {
+    const message_t refused = {.data = {ERROR, (uint8_t)error}, .length = 2};
+    const message_t *sent = error == XCP_ERROR_NONE ? response : &refused;
+    *frame = (hal_can_frame_t){.identifier = DRIVE_XCP_RESPONSE_FRAME_ID, .length = sent->length};
+    for (unsigned i = 0; i < sent->length; i++) {
+        frame->data[i] = sent->data[i];
+    }
+}
+
+bool xcp_late_response(xcp_t *xcp, const table_store_t *tables, hal_can_frame_t *response) {
+    xcp_error_t error;
+    if (!xcp_program_done(xcp, tables, &error)) {
+        return false;
+    }
+    write_response(response, &(message_t){.data = {RESPONSE}, .length = 1}, error);
+    return true;
 }
 
 bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp_context_t *context, uint32_t time_us,
@@ -276,15 +331,11 @@ bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp
     xcp->received_us = time_us;
     xcp->upload_left = 0; /* of an UPLOAD that the master has given up */
     message_t response = {.data = {RESPONSE}, .length = 1};
-    const xcp_error_t error = execute(xcp, hal, command, frame->length, context, time_us, &response);
-    if (error != XCP_ERROR_NONE) {
-        response = (message_t){.data = {ERROR, (uint8_t)error}, .length = 2};
-    }
-    *response_frame = (hal_can_frame_t){.identifier = DRIVE_XCP_RESPONSE_FRAME_ID, .length = response.length};
-    for (unsigned i = 0; i < response.length; i++) {
-        response_frame->data[i] = response.data[i];
-    }
-    return true;
+    const xcp_error_t error = xcp->pending && !interrupts_programming(command[0])
+                                  ? XCP_ERROR_BUSY
+                                  : execute(xcp, hal, command, frame->length, context, time_us, &response);
+    write_response(response_frame, &response, error);
+    return error != XCP_ERROR_NONE || !xcp->pending;
 }
 
 void xcp_supervise(xcp_t *xcp, bool bus_off, uint32_t time_us) {

@@ -11,12 +11,14 @@
  *               XCP_SCOPE_COMMAND arms, triggers or stops it (interrupts/sampler.h)
  *   0x30000000  texts of XCP_TEXT_BYTES: the identification of program and layout of its memory, which the A2L file has
  *               too (EPK), and the names of the events
+ *   0x40000000  machine tables (control/machine_tables.h): those in effect are read, new ones for the next start are
+ *               programmed (comms/xcp_program.h), where the port can load them (storage/table_store.h)
  *
  * Reading is free. Measuring, which takes time of the interrupts, and the triggered buffer need resource DAQ, writing a
- * parameter resource CAL/PAG. Either is unlocked by a seed, of which the key is every bit inverted, as the key of the
- * arming: a random or recorded frame opens nothing. A seed serves one attempt within ARMING_RESPONSE_MAX_US. Both are
- * locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or XCP_SILENT_US without a
- * command. A master that measures sends no command: then XCP_SILENT_US locks CAL/PAG alone.
+ * parameter resource CAL/PAG, programming tables resource PGM. Each is unlocked by a seed, of which the key is every bit
+ * inverted, as the key of the arming: a random or recorded frame opens nothing. A seed serves one attempt within
+ * ARMING_RESPONSE_MAX_US. All are locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or
+ * XCP_SILENT_US without a command. A master that measures sends no command: then XCP_SILENT_US locks all but DAQ.
  *
  * A write of a parameter is a set of one (parameter_set.h): staged, checked as any other, and applied or refused. It
  * is refused while another set is staged. In a run tunable parameters only. SET_REQUEST STORE_CAL stores.
@@ -38,6 +40,7 @@
 #include "interrupts/sampler.h"
 #include "storage/nvm_store.h"
 #include "storage/parameters.h"
+#include "storage/table_store.h"
 
 #define XCP_SILENT_US 10000000u
 #define XCP_ODTS_MAX SAMPLER_CHANNELS_MAX
@@ -50,6 +53,7 @@
 #define XCP_AREA_PARAMETERS 0x10000000u
 #define XCP_AREA_SCOPE 0x20000000u
 #define XCP_AREA_TEXT 0x30000000u
+#define XCP_AREA_TABLES 0x40000000u
 
 /* Words of the area of the triggered buffer. */
 typedef enum {
@@ -103,6 +107,8 @@ typedef struct {
     bool connected;
     uint8_t unlocked; /* XCP_RESOURCE_* */
     uint8_t seed_resource;
+    bool programming;           /* since PROGRAM_START */
+    bool pending;               /* a command waits for the memory */
     uint32_t seed, seed_us; /* 0: none */
     uint32_t received_us;
     uint32_t address;    /* memory transfer address */
@@ -118,6 +124,7 @@ typedef struct {
     const parameters_conditions_t *conditions;
     parameter_set_t *set;
     nvm_store_t *store;
+    table_store_t *tables; /* NULL: the port has tables of its own alone */
 } xcp_context_t;
 
 /* No session. memory: the drive, aligned as its words are. */
@@ -127,9 +134,12 @@ void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler
  * a pointer. [background] */
 void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler);
 
-/* Takes an XCP_COMMAND and writes its response; false when there is none. [background] */
+/* Takes an XCP_COMMAND and writes its response; false when there is none, or none yet. [background] */
 bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp_context_t *context, uint32_t time_us,
                  hal_can_frame_t *response);
+
+/* Writes the response to a command that has waited for the memory; false when there is none. [background] */
+bool xcp_late_response(xcp_t *xcp, const table_store_t *tables, hal_can_frame_t *response);
 
 /* Ends the session after XCP_SILENT_US, or at once in bus-off. Call it at least once in 35 minutes. [background] */
 void xcp_supervise(xcp_t *xcp, bool bus_off, uint32_t time_us);

@@ -5,6 +5,10 @@
 #include <stdint.h>
 
 enum {
+    PROGRAM_RESET = 0xCF, /* the first of the group PGM */
+    PROGRAM = 0xD0,
+    PROGRAM_CLEAR = 0xD1,
+    PROGRAM_START = 0xD2,
     ALLOC_ODT_ENTRY = 0xD3, /* the first of the group DAQ */
     ALLOC_ODT = 0xD4,
     ALLOC_DAQ = 0xD5,

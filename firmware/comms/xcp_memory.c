@@ -47,6 +47,8 @@ static uint8_t byte_at(const xcp_t *xcp, const parameters_t *parameters, uint32_
         return byte_of((uint32_t)parameters->values[offset / WORD_BYTES], offset);
     case XCP_AREA_SCOPE:
         return byte_of(xcp->scope[offset / WORD_BYTES], offset);
+    case XCP_AREA_TABLES:
+        return ((const uint8_t *)&machine_tables)[offset];
     default:
         return (uint8_t)text_of(xcp, offset / XCP_TEXT_BYTES)[offset % XCP_TEXT_BYTES];
     }
@@ -60,6 +62,8 @@ static uint32_t area_bytes(const xcp_t *xcp, uint32_t area) {
         return WORD_BYTES * PARAMETER_COUNT;
     case XCP_AREA_SCOPE:
         return WORD_BYTES * XCP_SCOPE_WORDS;
+    case XCP_AREA_TABLES:
+        return TABLE_STORE_BYTES;
     case XCP_AREA_TEXT:
         return XCP_TEXT_BYTES * (1u + XCP_EVENTS);
     default:

@@ -18,11 +18,13 @@ typedef enum {
     XCP_ERROR_SEQUENCE = 0x29,
     XCP_ERROR_DAQ_CONFIGURATION = 0x2A,
     XCP_ERROR_MEMORY_OVERFLOW = 0x30,
+    XCP_ERROR_GENERIC = 0x31,
     XCP_ERROR_SYNCHRONISED = 0x00,
 } xcp_error_t;
 
 #define XCP_RESOURCE_CALIBRATION 0x01u
 #define XCP_RESOURCE_DAQ 0x04u
+#define XCP_RESOURCE_PROGRAMMING 0x10u
 
 /* Bytes from an address on; false, with nothing written, when one of them is out of its area. [background] */
 bool xcp_memory_read(const xcp_t *xcp, const parameters_t *parameters, uint32_t address, unsigned bytes, uint8_t *to);

@@ -77,6 +77,9 @@ COLD bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config) {
         parameters_set(&drive->parameters, PARAMETER_TELEMETRY_PERIOD_MS, (int32_t)config->telemetry_period_ms);
     }
     nvm_store_init(&drive->store, hal, &drive->parameters);
+    if (config->stored_tables) {
+        table_store_init(&drive->tables, hal);
+    }
     comms_init(&drive->comms, config->node, hal_time_us(hal));
     comms_choose(&drive->comms, drive->parameters.values[PARAMETER_PROTOCOL], hal_time_us(hal));
     drive->thermal.step_us = hal_time_us(hal) - THERMAL_STEP_US / 2u; /* halfway between two telemetry cycles */
@@ -283,6 +286,7 @@ static void keep_memory(drive_t *drive, hal_t *hal, uint32_t time_us) {
     }
     const bool writable = state == DRIVE_STATE_FAULT || may_configure(drive);
     nvm_store_step(&drive->store, hal, &drive->parameters, time_us, writable);
+    table_store_step(&drive->tables, hal, writable);
 }
 
 /* The torque would carry the speed on, beyond the last reference. [SR-04] */
@@ -392,6 +396,7 @@ COLD void drive_background(drive_t *drive, hal_t *hal) {
         .trace = &drive->trace,
         .self_test = &drive->self_test,
         .control_parameters = &drive->control_parameters,
+        .tables = table_store_offered(&drive->tables) ? &drive->tables : NULL,
     };
     xcp_attach(&drive->comms.xcp, drive, DRIVE_WORDS, &drive->sampler);
     const bool commanded = comms_background(&drive->comms, hal, &objects, drive->control.state_machine.state, time_us);

@@ -26,6 +26,7 @@
 #include "monitors/watchdog_monitor.h"
 #include "storage/nvm_store.h"
 #include "storage/parameters.h"
+#include "storage/table_store.h"
 
 /* Without commands a run's torque ramps to zero in this time after the parameter command_timeout_ms, in steps of a
  * hundredth; after COMMAND_LOST_US it ends in the fault command_timeout, in the control interrupt, whatever the
@@ -77,6 +78,7 @@ typedef struct {
     /* Used by the background only. */
     comms_t comms;
     nvm_store_t store;
+    table_store_t tables;
     flux_angle_t flux_angle[HAL_PHASES_MAX];
     thermal_t thermal;
     temperature_t temperature;

@@ -14,6 +14,7 @@ typedef struct {
     uint32_t node;                 /* number on the bus, 0..NODE_MAX: the board's address switches */
     uint32_t telemetry_period_ms;  /* parameter of that name at the start, unless one is stored; 0: its default */
     uint32_t canopen_node;         /* parameter `protocol` at the start, likewise: 0, or a node-ID of CANopen */
+    bool stored_tables;            /* the port has called table_store_load: the drive takes new tables */
 } drive_config_t;
 
 /* True for the supported control rates of which a timer with this clock (hal_pwm_clock_hz, 25 to 400 MHz) makes half a

@@ -1,4 +1,4 @@
-/* Parameters: the first six pages of flash bank 2, which is written while the program runs from bank 1. */
+/* Parameters and tables: the first pages of flash bank 2, which is written while the program runs from bank 1. */
 #include "hal_nvm.h"
 #include "hal_time.h"
 #include "hal_watchdog.h"

@@ -14,6 +14,21 @@ extern uint32_t data_start[], data_end[], data_load[], bss_start[], bss_end[], s
 hal_t board;
 static drive_t drive;
 
+#ifdef MACHINE_TABLES_VARIABLE
+/* Tables of the program: what its variable begins with. Those in the memory take its place before the drive starts. */
+static void load_tables(void) {
+    const uintptr_t offset = (uintptr_t)&machine_tables - (uintptr_t)data_start;
+    const machine_tables_t *built_in = (const machine_tables_t *)((uintptr_t)data_load + offset);
+    (void)table_store_load(&board, board_control_rate_hz, built_in, &machine_tables);
+}
+
+#define STORED_TABLES true
+#else
+static void load_tables(void) {}
+
+#define STORED_TABLES false
+#endif
+
 static void control_handler(void) {
     if (control_begin(&board)) {
         drive_control_interrupt(&drive, &board);
@@ -58,7 +73,9 @@ static noreturn void run(void) {
         .controller = (drive_controller_t)BOARD_CONTROLLER,
         .node = BOARD_NODE,
         .telemetry_period_ms = BOARD_TELEMETRY_PERIOD_MS,
+        .stored_tables = STORED_TABLES,
     };
+    load_tables();
     const bool started = drive_init(&drive, &board, &config);
     board_interrupts_enable(&board);
     for (;;) {

@@ -209,7 +209,7 @@ def test_set_of_another_machine_is_not_loaded(make_bench, tmp_path):
 def test_memory_file_of_a_wrong_size_is_refused(make_bench, tmp_path):
     file = tmp_path / "memory.bin"
     file.write_bytes(b"text")
-    with pytest.raises(UsageError, match=rf"--memory {file}: not the memory of a drive, 12288 bytes"):
+    with pytest.raises(UsageError, match=rf"--memory {file}: not the memory of a drive, 32768 bytes"):
         make_bench(memory=file)
     assert file.read_bytes() == b"text"
 

@@ -286,6 +286,14 @@ int32_t degraded_torque_limit_q24(const degraded_t *degraded) {
 }
 
 /* No memory. */
+void table_store_init(table_store_t *store, const hal_t *hal) {
+    (void)store, (void)hal;
+}
+
+void table_store_step(table_store_t *store, hal_t *hal, bool writable) {
+    (void)store, (void)hal, (void)writable;
+}
+
 void nvm_store_init(nvm_store_t *store, const hal_t *hal, parameters_t *parameters) {
     (void)store, (void)hal, (void)parameters;
 }

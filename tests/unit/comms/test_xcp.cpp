@@ -49,8 +49,9 @@ class Xcp : public XcpBench {
         ASSERT_TRUE(xcp.daq.running);
     }
 
-    uint32_t areas[4] = {XCP_AREA_MEMORY, XCP_AREA_PARAMETERS, XCP_AREA_SCOPE, XCP_AREA_TEXT};
-    uint32_t sizes[4] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS, XCP_TEXT_BYTES *(1 + XCP_EVENTS)};
+    uint32_t areas[5] = {XCP_AREA_MEMORY, XCP_AREA_PARAMETERS, XCP_AREA_SCOPE, XCP_AREA_TEXT, XCP_AREA_TABLES};
+    uint32_t sizes[5] = {sizeof(drive_t), 4 * PARAMETER_COUNT, 4 * XCP_SCOPE_WORDS, XCP_TEXT_BYTES *(1 + XCP_EVENTS),
+                         sizeof(machine_tables_t)};
 };
 
 TEST_F(Xcp, answers_nothing_before_a_connect) {
@@ -296,7 +297,7 @@ TEST_F(Xcp, every_write_and_every_command_of_a_measurement_is_refused_while_lock
 
 TEST_F(Xcp, reads_each_area_up_to_its_end_and_nothing_beyond) {
     connect();
-    for (unsigned area = 0; area < 4; area++) {
+    for (unsigned area = 0; area < std::size(areas); area++) {
         const uint32_t begin = areas[area], end = begin + sizes[area];
         for (unsigned bytes = 1; bytes <= 7; bytes++) {
             EXPECT_EQ(short_upload(begin, bytes).size(), 1 + bytes);
@@ -318,7 +319,7 @@ TEST_F(Xcp, reads_each_area_up_to_its_end_and_nothing_beyond) {
     EXPECT_EQ(short_upload(0, 0), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(short_upload(0, 8), failed(XCP_ERROR_OUT_OF_RANGE));
     EXPECT_EQ(send({0xF5, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
-    for (uint32_t area = 4; area < 16; area++) {
+    for (uint32_t area = 5; area < 16; area++) {
         EXPECT_EQ(short_upload(area << 28, 1), failed(XCP_ERROR_OUT_OF_RANGE));
     }
     ASSERT_EQ(set_address(16), DONE);

@@ -112,15 +112,14 @@ TEST_F(NvmRing, every_bit_of_a_committed_record_that_flips_makes_it_damaged_unti
     EXPECT_TRUE(has(1, 2));
 }
 
-TEST_F(NvmRing, a_place_that_has_changed_in_memory_is_written_within_both_pages_or_not_at_all) {
+TEST_F(NvmRing, a_place_that_has_changed_in_memory_is_written_within_both_halves_or_not_at_all) {
     write(1);
     step(payload_of(2));
     const nvm_ring_t before = ring;
-    for (uint8_t nvm_ring_t::*const member : {&nvm_ring_t::newest_page, &nvm_ring_t::page, &nvm_ring_t::slot,
-                                              &nvm_ring_t::word, &nvm_ring_t::record_words}) {
-        for (unsigned changed = 0; changed < 256; changed++) {
+    const auto check = [&](auto nvm_ring_t::*member, unsigned values) {
+        for (unsigned changed = 0; changed < values; changed++) {
             ring = before;
-            ring.*member = uint8_t(changed);
+            ring.*member = std::remove_reference_t<decltype(ring.*member)>(changed);
             const auto memory = hal.nvm;
             step(payload_of(2));
             for (unsigned page = 0; page < HAL_NVM_PAGES; page++) {
@@ -129,6 +128,31 @@ TEST_F(NvmRing, a_place_that_has_changed_in_memory_is_written_within_both_pages_
                     << changed;
             }
             hal.nvm = memory;
+        }
+    };
+    check(&nvm_ring_t::newest_half, 256);
+    check(&nvm_ring_t::half, 256);
+    check(&nvm_ring_t::slot, 256);
+    check(&nvm_ring_t::word, 2 * HAL_NVM_PAGE_WORDS);
+    check(&nvm_ring_t::record_words, HAL_NVM_PAGE_WORDS);
+    check(&nvm_ring_t::erase, 256);
+}
+
+// The test's memory, as a host's, ends with its last page.
+TEST_F(NvmRing, a_length_or_first_page_that_has_changed_in_memory_is_read_and_written_within_the_memory_and_ends) {
+    write(1);
+    const nvm_ring_t before = ring;
+    for (const unsigned changed : {0u, 1u, 2u, 3u, 256u, 257u, 2047u, 2048u, 4096u, 32768u, 65535u}) {
+        for (const unsigned first_page : {PAGE, HAL_NVM_PAGES - 1u, 255u}) {
+            ring = before;
+            ring.record_words = uint16_t(changed);
+            ring.first_page = uint8_t(first_page);
+            payload_t payload;
+            nvm_ring_step(&ring, &hal, 0);
+            if (changed < RECORD_WORDS) { // what the caller has room for
+                nvm_ring_read(&ring, &hal, 1, payload.data());
+            }
+            EXPECT_LT(nvm_ring_place(&ring, &hal, 7) + 1u, 1u) << changed << ", " << first_page;
         }
     }
 }
@@ -195,6 +219,87 @@ TEST_F(NvmRing, fails_after_four_places_that_do_not_take_the_record_and_counts_t
         hal.worn_page = PAGE;
         for (unsigned attempt = 1; attempt <= NVM_RING_ATTEMPTS; attempt++) {
             EXPECT_EQ(step(payload_of(1)), attempt < NVM_RING_ATTEMPTS ? NVM_RING_BUSY : NVM_RING_FAILED) << attempt;
+        }
+    }
+}
+
+// --- Records that take several pages of each half ---
+
+constexpr unsigned LONG_WORDS = 2 * HAL_NVM_PAGE_WORDS + 100, LONG_PAGES = 3, LONG_PAGE = 4;
+
+class LongRecord : public testing::Test {
+  protected:
+    LongRecord() { nvm_init(&hal.nvm); }
+
+    static uint64_t word_of(uint32_t number, unsigned index) { return uint64_t(number) << 32 | (index * 2654435761u); }
+
+    void start() { nvm_ring_init(&ring, &hal, LONG_PAGE, LONG_WORDS); }
+
+    // Steps until the record is written or the power is lost; the number of steps.
+    unsigned write(uint32_t number) {
+        for (unsigned steps = 1;; steps++) {
+            const nvm_ring_result_t result =
+                nvm_ring_step(&ring, &hal, word_of(number, nvm_ring_payload_index(&ring)));
+            if (result != NVM_RING_BUSY || hal.nvm.power_lost) {
+                return steps;
+            }
+        }
+    }
+
+    // The newest record is the number's, word for word.
+    testing::AssertionResult has(uint32_t number) {
+        start();
+        const unsigned place = nvm_ring_place(&ring, &hal, ring.sequence);
+        if (ring.sequence != number || place == NVM_RING_NOWHERE) {
+            return testing::AssertionFailure() << "newest " << ring.sequence << " instead of " << number;
+        }
+        for (unsigned i = 0; i < LONG_WORDS - NVM_RING_OVERHEAD; i++) {
+            if (nvm_ring_payload(&ring, &hal, place, i) != word_of(number, i)) {
+                return testing::AssertionFailure() << "word " << i;
+            }
+        }
+        return testing::AssertionSuccess();
+    }
+
+    hal_t hal{};
+    nvm_ring_t ring{};
+};
+
+TEST_F(LongRecord, erases_every_page_of_the_other_half_and_takes_a_step_for_each_and_for_each_word) {
+    start();
+    for (uint32_t number = 1; number <= 5; number++) {
+        EXPECT_EQ(write(number), LONG_WORDS + (number > 1 ? LONG_PAGES : 0)) << number;
+        EXPECT_TRUE(has(number));
+    }
+    for (unsigned page = 0; page < HAL_NVM_PAGES; page++) {
+        const bool own = page >= LONG_PAGE && page < LONG_PAGE + 2 * LONG_PAGES;
+        EXPECT_EQ(hal.nvm.erasures[page], own ? 2u : 0u) << page;
+    }
+}
+
+// [SR-59]
+TEST_F(LongRecord, a_cut_at_any_operation_of_any_kind_leaves_the_record_before_or_the_new_one) {
+    start();
+    write(1);
+    write(2);
+    const nvm_t before = hal.nvm;
+    for (unsigned kind = 0; kind < NVM_CUT_KINDS; kind++) {
+        // Of the words in the middle, which are alike, every 19th.
+        constexpr unsigned LAST = LONG_WORDS + LONG_PAGES;
+        for (unsigned operation = 1; operation <= LAST; operation += operation < 8 || operation > LAST - 20 ? 1 : 19) {
+            hal.nvm = before;
+            hal.nvm.random = operation;
+            start();
+            hal.nvm.cut_kind = nvm_cut_t(kind);
+            hal.nvm.cut_after = operation;
+            write(3);
+            ASSERT_TRUE(hal.nvm.power_lost);
+            nvm_power_on(&hal.nvm);
+            const bool last = operation == LAST;
+            ASSERT_TRUE(has(2) || (last && has(3))) << kind << ", " << operation;
+            const uint32_t next = ring.sequence + 1;
+            write(next);
+            ASSERT_TRUE(has(next)) << "and the next one is written, " << kind << ", " << operation;
         }
     }
 }

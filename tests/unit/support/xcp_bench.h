@@ -60,7 +60,7 @@ class XcpBench : public testing::Test {
         frame.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
         frame.length = uint8_t(command.size());
         std::copy(command.begin(), command.begin() + std::min<long>(8, long(command.size())), frame.data);
-        const xcp_context_t context = {&drive->parameters, &conditions, &drive->comms.set, &drive->store};
+        const xcp_context_t context = {&drive->parameters, &conditions, &drive->comms.set, &drive->store, tables};
         return xcp_receive(&xcp, &memory->hal, &frame, &context, time_us, &response);
     }
 
@@ -130,6 +130,7 @@ class XcpBench : public testing::Test {
     std::unique_ptr<drive_t> drive = std::make_unique<drive_t>();
     xcp_t &xcp = drive->comms.xcp;
     parameters_conditions_t conditions{};
+    table_store_t *tables = nullptr; // of a port that cannot load them
     uint32_t time_us = 1000;
 };
 

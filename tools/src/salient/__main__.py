@@ -159,6 +159,12 @@ def _scope(options: argparse.Namespace) -> int:
     return run(options)
 
 
+def _tables(options: argparse.Namespace) -> int:
+    from salient.bench.tables import run
+
+    return run(options)
+
+
 def _parameters(options: argparse.Namespace) -> int:
     from salient.bench.parameter_file import run
 
@@ -259,6 +265,7 @@ _COMMANDS = {
     "view": _view,
     "tab": _tab,
     "scope": _scope,
+    "tables": _tables,
     "identify": _identify,
     "parameters": _parameters,
     "benchmark": _benchmark,

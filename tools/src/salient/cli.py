@@ -248,6 +248,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                         help=f"{either(BOARD_ENCODERS)}: it counts to its absolute position at power-up, or is "
                         "absolute after its index has passed, before which no switch closes (default "
                         f"{BOARD_ENCODERS[0]})")
+    action.add_argument("--stored-tables", action="store_true", help="the drive takes the tables of another machine file "
+                        "over CAN (tables); its laws are not compiled for those of one machine")
     action.add_argument("--out", type=Path, default=OUT / "board", metavar="DIR", help="folder (default %(default)s)")
     text = "write an image into the flash of a board, by OpenOCD or st-flash"
     action = actions.add_parser("flash", help=text, description=text, prog=f"{COMMAND} board flash")
@@ -338,6 +340,14 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
     identify.add_argument("--out", type=Path, default=OUT / "identify" / "motor.toml", metavar="FILE.toml",
                           help="machine file; its map and its page have the same name (default %(default)s)")
     _add_node(identify)
+
+    tables = command("tables", "write the tables of another machine file into the memory of a running drive, which has "
+                     "them from its next start on")
+    tables.add_argument("file", metavar="NAME|FILE", help="machine file, as of identify")
+    _add_can(tables)
+    _add_machine(tables)
+    _add_node(tables)
+    tables.add_argument("--out", type=Path, metavar="FILE.bin", help="instead: write them to a file, for another tool")
 
     parameters = command("parameters", "parameters and fault log of a running drive")
     actions = parameters.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=_Parser)

@@ -116,7 +116,7 @@ def _board_arguments(config: BenchConfig) -> list[str]:
         if given:
             raise UsageError(f"{option}: not with --target {BOARD_BUILD}")
     elf = build_image(config.machine, clock_mhz=BOARD_CLOCK_MHZ, controller=config.controller, node=config.node,
-                      bit_rate=config.bit_rate)
+                      bit_rate=config.bit_rate, stored_tables=config.memory is not None)
     wiring = BUILD / "stm32g4.wiring"
     keep_text(wiring, "".join(f"{pin.signal} {pin.pin}\n" for pin in read_pins()))
     return [str(elf), "--wiring", str(wiring)]

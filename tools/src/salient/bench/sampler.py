@@ -205,7 +205,7 @@ def arm(session: LoggingClient, signals: Sequence[str], trigger: str | None = No
     condition = Trigger() if trigger is None else parse_trigger(trigger, variables)
     _check(divider, before)
     with connected(session) as master:
-        _check_layout(master, variables)
+        check_layout(master, variables)
         words = len(variables.layout.bits("sampler.ring")) // (8 * _WORD_BYTES) - CHANNELS_MAX
         capacity = -(-words // len(quantities))  # the last record begins within them
         records_before = min(int(before * capacity), capacity - 2)
@@ -241,13 +241,19 @@ def variables_of(session: LoggingClient) -> Variables:
     return _variables("host" if options is None else options.build, session.machine)
 
 
-def _check_layout(master: Master, variables: Variables) -> None:
-    master.setMta(AREA_TEXT)
-    text = bytes(master.fetch(len("salient") + 24)).decode("ascii", "replace")
+def check_layout(master: Master, variables: Variables) -> None:
+    """ScopeError: the drive's memory has another layout than a build's."""
+    text = program_of(master)
     layout = variables.layout
     if text[7:15] != f"{layout.hash:08x}" or text[23:31] != f"{layout.size // _WORD_BYTES:08x}":
         raise ScopeError(f"the drive ({text}) is of other sources than this build, or of another processor: its "
                          "variables are elsewhere in its memory")
+
+
+def program_of(master: Master) -> str:
+    """The drive's EPK (firmware/comms/xcp.h): hashes of its headers and of its DBC, and the size of its memory."""
+    master.setMta(AREA_TEXT)
+    return bytes(master.fetch(len("salient") + 24)).decode("ascii", "replace")
 
 
 def _write(master: Master, word: str, value: int, number: int = 0) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 COMMAND_ID, RESPONSE_ID = (drive_database().get_message_by_name(name).frame_id
                            for name in ("XCP_COMMAND", "XCP_RESPONSE"))
-AREA_PARAMETERS, AREA_SCOPE, AREA_TEXT = 0x10000000, 0x20000000, 0x30000000
+AREA_PARAMETERS, AREA_SCOPE, AREA_TEXT, AREA_TABLES = 0x10000000, 0x20000000, 0x30000000, 0x40000000
 """Addresses of firmware/comms/xcp.h; the drive's memory begins at 0."""
 RESPONSE_TIMEOUT_S = 2.0
 """Long enough for a session whose time moves by itself, which reads what came before the response first."""
@@ -138,6 +138,7 @@ def connected(session: LoggingClient) -> Iterator[Master]:
                                "max_dlc_required": True}}}, log_level=logging.CRITICAL)
     application.transport.timeout = _WALL_S
     application.general.seed_n_key_function = key_of
+    application.general.disable_error_handling = True  # it ends the process when the drive refuses a command
     application.transport.layer = "CAN"
     master = Master("can", config=application, transport_layer_interface=interface)
     try:

@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
 def _build(options: argparse.Namespace) -> int:
     make_folder(options.out)
     elf = build_image(options.machine, clock_mhz=int(options.clock), controller=options.controller, node=options.node,
-                      bit_rate=options.bit_rate, index=options.encoder == "index")
+                      bit_rate=options.bit_rate, index=options.encoder == "index", stored_tables=options.stored_tables)
     name = machine_path(options.machine).stem
     made = options.out / f"{name}.elf"
     shutil.copyfile(elf, made)
@@ -55,9 +55,9 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def build_image(machine: str, *, clock_mhz: int = 170, controller: str = "salient", node: int = 0,
-                bit_rate: int = 1_000_000, index: bool = False) -> Path:
+                bit_rate: int = 1_000_000, index: bool = False, stored_tables: bool = False) -> Path:
     """The ELF image for a machine and the options of the board; of the sources only tables and port are compiled where
-    the firmware of the preset is up to date. UsageError: a machine that the board cannot drive, or a bit rate that its
+    the firmware of the preset is up to date, all of them for one that takes tables over CAN. UsageError: a machine that the board cannot drive, or a bit rate that its
     clock does not make. RunFailed: the build fails."""
     from salient.machine.file import load_machine  # NumPy and pydantic, and here only
 
@@ -72,7 +72,8 @@ def build_image(machine: str, *, clock_mhz: int = 170, controller: str = "salien
     for missing, package in (("cmake", "cmake"), ("arm-none-eabi-gcc", "gcc-arm-none-eabi")):
         if shutil.which(missing) is None:
             raise UsageError(f"{missing} is missing: install the Debian package {package}")
-    settings = {"SALIENT_MACHINE_FILE": path, "SALIENT_BUILT": BUILD / PRESET, "SALIENT_PYTHON": sys.executable,
+    settings = {"SALIENT_MACHINE_FILE": path, "SALIENT_PYTHON": sys.executable,
+                **({"SALIENT_STORED_TABLES": "ON"} if stored_tables else {"SALIENT_BUILT": BUILD / PRESET}),
                 "SALIENT_BOARD_CLOCK_MHZ": clock_mhz, "SALIENT_BOARD_CAN_BIT_RATE": bit_rate,
                 "SALIENT_BOARD_CONTROLLER": CONTROLLERS.index(controller), "SALIENT_BOARD_NODE": node,
                 "SALIENT_BOARD_ENCODER_INDEX": "ON" if index else "OFF"}

@@ -27,7 +27,14 @@ def plant_layout() -> str:
 def tables_layout() -> str:
     """C source of machine_layout_tables.c."""
     return "\n".join([*_HEAD, '#include "control/machine_tables.h"', "",
-                      *_definition(TABLES, "machine_tables_structure")])
+                      *_places(TABLES), *_definition(TABLES, "machine_tables_structure")])
+
+
+def _places(structure: Structure) -> list[str]:
+    """Members are in memory where tools that write it expect them."""
+    return [*(f"static_assert(offsetof({structure.type}, {member.name}) == {offset}, \"{member.name}\");"
+              for member, offset in zip(structure.members, structure.offsets, strict=False)),
+            f"static_assert(sizeof({structure.type}) == {structure.offsets[-1]}, \"{structure.type}\");", ""]
 
 
 def _definition(structure: Structure, name: str) -> list[str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from salient.bench.drive import Experiment
-from salient.bench.sampler import _check_layout, _control_rate_hz, _member, variables_of
+from salient.bench.sampler import check_layout, _control_rate_hz, _member, variables_of
 from salient.bench.session import Session
 from salient.bench.xcp import connected
 from salient.errors import RunFailed
@@ -59,7 +59,7 @@ class Link:
         self._session, self._master = session, master
         variables = variables_of(session)
         self._variables = variables
-        _check_layout(master, variables)
+        check_layout(master, variables)
         self.period_s = 1.0 / _control_rate_hz(session)
         self.limit_A = float(session.drive.parameters["current_limit_A"])
         self._current_A = variables.quantity("control.measurement.current_q9[0]").factor

@@ -81,6 +81,12 @@ class Member:
         """Bytes in the image."""
         return self.dtype.itemsize * math.prod(self.shape)
 
+    @property
+    def alignment(self) -> int:
+        """Bytes in memory: of the largest number in an element."""
+        return max(part.itemsize for part in ([self.dtype[name] for name in self.dtype.names] if self.dtype.names
+                                              else [self.dtype]))
+
     def array(self, *source: Any) -> np.ndarray:
         """The value as it is in the image; OverflowError when the type cannot hold it."""
         value = self.value(*source)
@@ -103,6 +109,25 @@ class Structure:
     def size(self) -> int:
         """Bytes in the image."""
         return sum(member.size for member in self.members)
+
+    @property
+    def offsets(self) -> list[int]:
+        """Of each member in memory, and at the end the size there, by the rules of every processor here: a number is
+        at a multiple of its size. salient.generate.machine_layout checks them against the compiler's."""
+        offsets, end = [], 0
+        for member in self.members:
+            offsets.append(-(-end // member.alignment) * member.alignment)
+            end = offsets[-1] + member.size
+        whole = max(member.alignment for member in self.members)
+        return [*offsets, -(-end // whole) * whole]
+
+    def in_memory(self, packed: bytes) -> bytes:
+        """The structure as a program has it, from its part of an image; zeros between members."""
+        memory, at = bytearray(self.offsets[-1]), 0
+        for member, offset in zip(self.members, self.offsets, strict=False):
+            memory[offset:offset + member.size] = packed[at:at + member.size]
+            at += member.size
+        return bytes(memory)
 
     def packed(self, *source: Any) -> bytes:
         """The part of the image."""
