@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
+import struct
 from collections import defaultdict
 
 import can
@@ -283,6 +285,47 @@ def test_a_database_that_cannot_be_used_is_one_line(salient_without_build, tmp_p
     assert done.stderr.startswith(f"salient: {line}") and done.stderr.count("\n") == 1, done.stderr
 
 
+SELECTED = """VERSION ""
+BU_: A
+BO_ 300 M: 8 A
+ SG_ m M : 0|8@1+ (1,0) [0|0] "" A
+ SG_ x m0 : 8|8@1+ (1,0) [0|0] "" A
+"""
+
+
+@pytest.mark.parametrize(
+    ("statements", "reason"),
+    [
+        (('BA_DEF_ BO_ "GenMsgSendType" ENUM "a","b";', 'BA_DEF_DEF_ "GenMsgSendType" "a";',
+          'BA_ "GenMsgSendType" BO_ 300 7;'),
+         "line 8: the attribute 'GenMsgSendType' is 7: must be 0 to 1, as its list has"),
+        (('BA_DEF_ BO_ "GenMsgSendType" ENUM "a","b";', 'BA_DEF_DEF_ "GenMsgSendType" "a";',
+          'BA_ "GenMsgSendType" BO_ 300 "b";'),
+         "line 8: the attribute 'GenMsgSendType' is 'b': must be a number"),
+        (('BA_DEF_ BO_ "VFrameFormat" INT 0 99;', 'BA_DEF_DEF_ "VFrameFormat" 88;'),
+         "line 7: the attribute 'VFrameFormat' is 88: must be 0 to 15, as its list has"),
+        (('BA_ "Mine" BO_ 300 7;',), "line 6: the attribute 'Mine' is not defined (BA_DEF_)"),
+        (('VAL_ 300 x 0 "a" 1.5 "b" ;',), "line 6: VAL_ names '1.5': must be a whole number"),
+        (('BA_DEF_ SG_ "GenSigStartValue" STRING;', 'BA_ "GenSigStartValue" SG_ 300 x "abc";',
+          'BO_ 301 N: 8 A', ' SG_ y : 0|8@1+ (0.5,0) [0|0] "" A', 'BA_ "GenSigStartValue" SG_ 301 y "abc";'),
+         "the parser ends with TypeError: can't multiply sequence"),
+        (('BA_DEF_ BO_ "SystemMessageLongSymbol" INT 0 9;', 'BA_ "SystemMessageLongSymbol" BO_ 300 3;'),
+         "3 is no name of a message, signal or node"),
+        (("SG_MUL_VAL_ 300 x m 0-5000000000;",), "x is there from 0 to 5000000000, at most 4096 values"),
+        (("SG_MUL_VAL_ 300 x m " + ", ".join(["0-4000"] * 25) + ";",),
+         "100025 values in ranges SG_MUL_VAL_, at most 100000"),
+        (("BO_ 301 N: 8 A", ' SG_ y : 99999999999|8@1+ (1,0) [0|0] "" A'),
+         "y has 8 bits from bit 99999999999 on, at most 800000"),
+    ],
+)  # fmt: skip
+def test_a_statement_that_the_parser_does_not_take_is_named(salient_without_build, tmp_path, statements, reason):
+    """Also of a number for which it would take hours or all memory."""
+    (tmp_path / "a.dbc").write_text(SELECTED + "\n".join(statements) + "\n", encoding="utf-8")
+    done = salient_without_build("monitor", "--can", "unix:none", "--dbc", "a.dbc")
+    assert (done.stdout, done.returncode) == ("", 2)
+    assert done.stderr.startswith(f"salient: --dbc a.dbc: no valid DBC: {reason}") and done.stderr.count("\n") == 1
+
+
 @pytest.fixture
 def decoded(salient_without_build, tmp_path):
     """Values of a log by message and signal, as text, and what was said, for a database and frames."""
@@ -330,6 +373,39 @@ def test_what_no_frame_carries_is_left_out_with_a_line(decoded):
     assert sorted(said.splitlines()) == [
         "salient: --dbc a.dbc: LONG has 200 bytes, a frame at most 64, and is left out",
         "salient: --dbc a.dbc: M.y is beyond the 8 bytes of the message and is left out"]
+
+
+@pytest.mark.parametrize(("signal", "left"), [
+    ("x : 0|64@1+ (1e308,0)", {}), ("x : 0|64@1- (1,1e400)", {}), (f"x : 0|8@1+ (1{'0' * 400},0)", {}),
+    ("x : 0|8@1+ (1e300,0)", {"M.x": ["2.55e+302"]}),
+])
+@pytest.mark.filterwarnings("error")
+def test_values_beyond_a_float_are_left_out_with_a_line(decoded, signal, left):
+    found, said = decoded(DBC.format(f' SG_ {signal} [0|0] "" A\n SG_ y : 0|8@1+ (1,0) [-1e400|1e400] "" A\n')
+                          + f'VAL_ 300 y 1{"0" * 400} "never" 255 "all" ;\n', [(300, b"\xff" * 8)])
+    assert found == {**left, "M.y": ["255"]}
+    assert said == ("" if left else "salient: --dbc a.dbc: M.x has values beyond a floating-point number of 64 bits by "
+                    "its factor and offset and is left out\n")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_float_is_infinite_by_its_bits_and_by_nothing_else(decoded):
+    found, said = decoded(DBC.format(' SG_ x : 0|64@1- (3,0) [0|0] "" A\n') + "SIG_VALTYPE_ 300 x : 2;\n",
+                          [(300, struct.pack("<d", value)) for value in (1.5, 1e308, math.inf, -math.nan)])
+    assert (found, said) == ({"M.x": ["4.5", "inf", "inf", "nan"]}, "")
+
+
+@pytest.mark.parametrize(("signals", "statement", "out"), [
+    (("m M : 60", "x m0 : 8"), "",
+     ("M.m is beyond the 8 bytes of the message", "M.x is selected by m, which no frame has,")),
+    (("m M : 0", "x m0M : 8", "y m0M : 16"), "SG_MUL_VAL_ 300 x y 0-5;\nSG_MUL_VAL_ 300 y x 0-5;",
+     ("M.x is selected by y, which no frame has,", "M.y is selected by x, which no frame has,")),
+])  # fmt: skip
+def test_signals_without_their_multiplexer_are_left_out_with_a_line(decoded, signals, statement, out):
+    found, said = decoded(DBC.format("".join(f' SG_ {each}|8@1+ (1,0) [0|0] "" A\n' for each in (*signals, "z : 24")))
+                          + f"{statement}\n", [(300, bytes(8))])
+    assert "M.x" not in found and found["M.z"] == ["0"]
+    assert said.splitlines() == [f"salient: --dbc a.dbc: {line} and is left out" for line in out]
 
 
 @pytest.mark.parametrize(("kind", "value", "shown"), [

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import sys
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
+from decimal import Decimal, InvalidOperation
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import cantools
-from cantools.database.can import Database, Message
+from cantools.database.can import Database, Message, Signal
+from cantools.database.can.formats.dbc import ATTRIBUTE_DEFINITION_VFRAMEFORMAT
 
-from salient.bus.signals import FrameKey, big_endian_bit, drive_database, frame_key, rig_database
-from salient.errors import UsageError, shown
+from salient.bus.signals import FrameKey, big_endian_bit, drive_database, frame_key, raw_range, rig_database
+from salient.errors import SHOWN_MAX, UsageError, shown
 from salient.machine.map_import.text import decode
 from salient.toml_file import TextFileError, read_bytes
 
@@ -24,10 +27,21 @@ _REASON_MAX = 160  # characters of what the parser says
 _FILE_BYTES_MAX = 100_000_000
 _MESSAGE_BYTES_MAX = 100_000
 """Length of a message of a transport protocol; J1939 has 1785 bytes, ISO 15765 4095."""
+_RANGE_MAX, _RANGES_MAX = 4096, 100_000
+"""Values of a multiplexer in a range, and in all ranges of a file: a signal is there with any of them."""
 _CYCLE_MAX_MS = 1_000_000_000
 _FRAME_BYTES_MAX = 64
 _BITS_MAX = 64
 """Length of a signal that is decoded."""
+_MULTIPLEXER_MAX = 2**_BITS_MAX - 1
+_PARSERS = ("cantools", "textparser")
+_FRAME_FORMAT, _PLACE = "VFrameFormat", "place"
+_LISTED = ("GenMsgSendType", _FRAME_FORMAT)
+"""Attributes whose numbers the parser takes for places in their lists."""
+_DEFINITION = re.compile(r'(?m)^\s*BA_DEF_(?:REL_)?\s+(?:\w+_\s+)?"([^"]*)"\s+(\w+)\s*((?:"[^"]*"|[^";])*);')
+_STATEMENT = re.compile(r'''(?mx) ^[ \t]* (?:
+    BA_(?P<default>DEF_DEF_)?(?:REL_)? \s+ "(?P<name>[^"]*)" \s+ [^";]*? (?P<value>"[^"]*"|[^\s";]+) \s* ;
+    | VAL_ \s+ \w+ \s+ (?:\w+ \s+)? (?P<names>(?:[^\s";]+ \s+ "[^"]*" \s*)+) ;)''')
 
 
 def load_databases(paths: Sequence[Path], node: int = 0) -> tuple[Database, ...]:
@@ -75,16 +89,13 @@ def _load(path: Path) -> Database:
         text = decode(read_bytes(path, _FILE_BYTES_MAX))
     except TextFileError as error:
         raise UsageError(f"{OPTION} {path}: {error}") from None
-    for name, length in re.findall(r"(?m)^[ \t]*BO_ +\S+ +(\w+) *: *([0-9]+)", text):
-        if int(length) > _MESSAGE_BYTES_MAX:  # the parser takes time and memory for each bit of it
-            raise UsageError(f"{OPTION} {path}: no valid DBC: {name} has {shown(int(length))} bytes, at most "
-                             f"{_MESSAGE_BYTES_MAX}")
+    if reason := _too_large(text):
+        raise UsageError(f"{OPTION} {path}: no valid DBC: {reason}")
     logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of is an error here
     try:
         database = cantools.database.load_string(text, database_format="dbc", strict=False, prune_choices=False)
     except Exception as error:  # the parser raises whatever a text leads it to
-        reason = " ".join(str(getattr(error, "e_dbc", error)).split()) or type(error).__name__
-        raise UsageError(f"{OPTION} {path}: no valid DBC: {reason[:_REASON_MAX]}") from None
+        raise UsageError(f"{OPTION} {path}: no valid DBC: {_reason(error, text)[:_REASON_MAX]}") from None
     assert isinstance(database, Database)
     if not database.messages:
         raise UsageError(f"{OPTION} {path}: no valid DBC: it defines no message")
@@ -98,6 +109,7 @@ def _load(path: Path) -> Database:
                        "out")
             database.messages.remove(message)
             continue
+        _check_names(path, message)
         _check_cycle(path, message)
         _check(path, message)
         _name_signals(path, message)
@@ -106,8 +118,79 @@ def _load(path: Path) -> Database:
     return database
 
 
+def _too_large(text: str) -> str:
+    """Refuses numbers for each of whose units the parser takes time and memory; empty without any."""
+    bits_max = 8 * _MESSAGE_BYTES_MAX
+    for name, length in re.findall(r"(?m)^[ \t]*BO_ +\S+ +(\w+) *: *([0-9]+)", text):
+        if _above(length, _MESSAGE_BYTES_MAX):
+            return f"{name} has {length[:SHOWN_MAX]} bytes, at most {_MESSAGE_BYTES_MAX}"
+    for name, start, length in re.findall(r"(?m)^[ \t]*SG_ +(\w+)[^:\n]*: *([0-9]+)\|([0-9]+)@", text):
+        if _above(start, bits_max) or _above(length, bits_max):
+            return f"{name} has {length[:SHOWN_MAX]} bits from bit {start[:SHOWN_MAX]} on, at most {bits_max}"
+    every = 0
+    for name, ranges in re.findall(r"(?m)^[ \t]*SG_MUL_VAL_ +\S+ +(\w+) +\w+ +([^;]*);", text):
+        for low, high in re.findall(r"([0-9]+) *- *([0-9]+)", ranges):
+            values = _RANGE_MAX + 1
+            if not (_above(low, _MULTIPLEXER_MAX) or _above(high, _MULTIPLEXER_MAX)):
+                values = max(0, int(high) - int(low) + 1)
+            if values > _RANGE_MAX:
+                return f"{name} is there from {low[:SHOWN_MAX]} to {high[:SHOWN_MAX]}, at most {_RANGE_MAX} values"
+            every += values
+    return "" if every <= _RANGES_MAX else f"{every} values in ranges SG_MUL_VAL_, at most {_RANGES_MAX}"
+
+
+def _above(digits: str, limit: int) -> bool:
+    """Whether a number is larger, which may have more digits than Python converts."""
+    digits = digits.lstrip("0")
+    return len(digits) > len(str(limit)) or int(digits or "0") > limit
+
+
+def _reason(error: Exception, text: str) -> str:
+    """Words of the parser about a text where these are meant for a reader, else the statement that it fails for."""
+    cause = getattr(error, "e_dbc", None) or error
+    words = " ".join(str(cause).split())
+    if type(cause).__module__.partition(".")[0] in _PARSERS and words:
+        return words
+    return _mistake(text) or f"the parser ends with {type(cause).__name__}{f': {words}' if words else ''}"
+
+
+def _mistake(text: str) -> str:
+    """The first statement with a value that its definition does not have, and that the parser takes for one; empty
+    when there is none."""
+    kinds = {name: (kind, len(re.findall(r'"[^"]*"', rest))) for name, kind, rest in _DEFINITION.findall(text)}
+    if kinds.get(_FRAME_FORMAT, ("", 0))[0] == "INT":
+        kinds[_FRAME_FORMAT] = _PLACE, len(ATTRIBUTE_DEFINITION_VFRAMEFORMAT.choices)
+    for found in _STATEMENT.finditer(text):
+        line, name, value = text.count("\n", 0, found.start()) + 1, found["name"], (found["value"] or "").strip('"')
+        if found["names"] is not None:
+            wrong = next((each for each in re.findall(r'([^\s"]+)\s+"[^"]*"', found["names"])
+                          if not re.fullmatch(r"[-+]?[0-9]+", each)), None)
+            if wrong is not None:
+                return f"line {line}: VAL_ names {shown(wrong)}: must be a whole number"
+            continue
+        if name not in kinds:
+            return f"line {line}: the attribute {shown(name)} is not defined (BA_DEF_)"
+        kind, entries = kinds[name]
+        try:
+            by_text = kind == "STRING" or (kind == "ENUM" and found["default"])
+            number = None if by_text else Decimal(value)
+        except InvalidOperation:
+            return f"line {line}: the attribute {shown(name)} is {shown(value)}: must be a number"
+        if name in _LISTED and kind in ("ENUM", _PLACE) and number is not None and not 0 <= number < entries:
+            return f"line {line}: the attribute {shown(name)} is {value}: must be 0 to {entries - 1}, as its list has"
+    return ""
+
+
 def _say(path: Path, text: str) -> None:
     print(f"salient: {OPTION} {path}: {text}", file=sys.stderr, flush=True)
+
+
+def _check_names(path: Path, message: Message) -> None:
+    """UsageError: an attribute gives a message, its sender or a signal a name that a command cannot have."""
+    for name in (message.name, *message.senders, *(signal.name for signal in message.signals)):
+        if not isinstance(name, str) or not re.fullmatch(r"[^\s.\x00-\x1f]+", name):
+            raise UsageError(f"{OPTION} {path}: no valid DBC: {shown(name)} is no name of a message, signal or node "
+                             "(attributes System...LongSymbol)")
 
 
 def _check_cycle(path: Path, message: Message) -> None:
@@ -132,9 +215,55 @@ def _check(path: Path, message: Message) -> None:
             reason = f"is a floating-point number of {signal.length} bits"
         elif signal.length > _BITS_MAX:
             reason = f"has {signal.length} bits, more than {_BITS_MAX},"
+        elif not _has_finite_values(signal):
+            reason = "has values beyond a floating-point number of 64 bits by its factor and offset"
         if reason:
             _say(path, f"{message.name}.{signal.name} {reason} and is left out")
             message.signals.remove(signal)
+            continue
+        _drop_what_no_frame_has(signal)
+    while selected := next((signal for signal in message.signals if not _is_selected(message, signal)), None):
+        _say(path, f"{message.name}.{selected.name} is selected by {selected.multiplexer_signal}, which no frame has, "
+                   "and is left out")
+        message.signals.remove(selected)
+
+
+def _is_selected(message: Message, signal: Signal) -> bool:
+    """Whether the chain of multiplexers that select a signal ends."""
+    by_name = {each.name: each for each in message.signals}
+    for _ in message.signals:
+        if not signal.multiplexer_ids or signal.multiplexer_signal is None:
+            return True
+        if signal.multiplexer_signal not in by_name:
+            return False
+        signal = by_name[signal.multiplexer_signal]
+    return False
+
+
+def _has_finite_values(signal: Signal) -> bool:
+    """Whether factor and offset make no number too large of those that the bits of a signal have; a floating-point
+    signal is infinite by its own bits, too, which is no mistake of the database."""
+    raw = (0, 1) if signal.is_float else raw_range(signal)
+    try:
+        return all(math.isfinite(number * float(signal.scale) + float(signal.offset)) for number in raw)
+    except OverflowError:  # a whole number of hundreds of digits
+        return False
+
+
+def _drop_what_no_frame_has(signal: Signal) -> None:
+    """Removes names of values that are wider than a signal, and limits that are no numbers."""
+    if signal.choices and any(abs(number) >> _BITS_MAX for number in signal.choices):
+        kept = ((number, text) for number, text in signal.choices.items() if not abs(number) >> _BITS_MAX)
+        signal.choices = OrderedDict(kept)
+    if not all(_is_number(limit) for limit in (signal.minimum, signal.maximum)):
+        signal.minimum = signal.maximum = None
+
+
+def _is_number(limit: float | None) -> bool:
+    try:
+        return limit is None or math.isfinite(limit)
+    except OverflowError:
+        return False
 
 
 def _name_signals(path: Path, message: Message) -> None:

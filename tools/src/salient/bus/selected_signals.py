@@ -10,7 +10,7 @@ import can
 import cantools
 from cantools.database.can import Database
 
-from salient.bus.signals import BusSignals, Signal, SignalTable, is_enumeration, near_signals
+from salient.bus.signals import BusSignals, Signal, SignalTable, is_enumeration, near_signals, raw_range
 from salient.errors import UsageError
 
 _DECIMALS_MAX = 4
@@ -105,8 +105,7 @@ def _width(definition: cantools.database.can.Signal) -> int:
         return max(len(str(text)) for text in definition.choices.values())
     if definition.is_float:
         return len("-1.23457e-05")
-    bits = definition.length - (1 if definition.is_signed else 0)
-    raw = (-(2**bits) if definition.is_signed else 0, 2**bits - 1)
+    raw = raw_range(definition)
     offset, scale = float(definition.offset), float(definition.scale)
     limits = (definition.minimum, definition.maximum)
     if None in limits or limits[0] == limits[1]:

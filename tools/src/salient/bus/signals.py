@@ -320,10 +320,16 @@ def physical(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.nda
     """Physical values of a signal, as floats. frames: see raw_bits."""
     if signal.is_float:
         bits = {16: "<u2", 32: "<u4", 64: "<u8"}[signal.length]
-        field = raw_bits(frames, signal).astype(bits).view(bits.replace("u", "f")).astype(float)
-    else:
-        field = whole(frames, signal)
-    return field * float(signal.scale) + float(signal.offset)
+        field = raw_bits(frames, signal).astype(bits).view(bits.replace("u", "f"))
+        with np.errstate(all="ignore"):  # infinite and not-a-number are values of its bits
+            return np.asarray(field.astype(float) * float(signal.scale) + float(signal.offset))
+    return whole(frames, signal) * float(signal.scale) + float(signal.offset)
+
+
+def raw_range(signal: cantools.database.can.Signal) -> tuple[int, int]:
+    """The least and the largest whole number that the bits of a signal have."""
+    bits = signal.length - (1 if signal.is_signed else 0)
+    return -(1 << bits) if signal.is_signed else 0, (1 << bits) - 1
 
 
 def whole(frames: np.ndarray, signal: cantools.database.can.Signal) -> np.ndarray:
