@@ -85,6 +85,22 @@ def test_invalid_condition_is_named(tmp_path, text, message):
     assert str(caught.value).startswith(f"{path}: {message}")
 
 
+@pytest.mark.parametrize(("text", "message"), [
+    ("[parameters]\nnonesuch = 1", "parameters.nonesuch: unknown parameter; the nearest of "),
+    ("[parameters]\ntorque_max_Nm = 500", "parameters.torque_max_Nm: 500: must be a number from "),
+    ("[parameters]\nunder_voltage_V = 310", "parameters.under_voltage_V: 310 V: must be below over_voltage_V, "),
+    ("[bench]\nsupply_voltage_V = 48", "supply_voltage_V: 48 V: must not be below under_voltage_V, "),
+    ('true_machine = "nonesuch"', "machine 'nonesuch': no such file"),
+])  # fmt: skip
+@pytest.mark.parametrize("command", [("run",), ("sweep", "--set", "torque_slew_rate_Nm_s=100,200")])
+def test_a_value_that_the_drive_refuses_is_named_with_its_file(salient_without_build, tmp_path, command, text, message):
+    (tmp_path / "mine.toml").write_text(f"{HEAD}{text}\n")
+    done = salient_without_build(*command, "mine.toml", "--out", "out")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"salient: mine.toml: {message}") and done.stderr.count("\n") == 1, done.stderr
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
 def test_every_bench_variable_may_be_set_from_the_start(tmp_path):
     """Every bench variable is accepted near the value of the machine file, and the drive runs."""
     values = {"supply_voltage_V": 230.0, "current_sensor_gain": 1.01, "truth_period_us": 500, "current_noise_A": 0.02,

@@ -87,11 +87,12 @@ def _sim(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     from salient.experiments.scenario import load_scenarios, run_all, with_true_machine
 
-    scenarios = with_true_machine(load_scenarios(scenario_path(options.scenario)), options.true_machine)
+    path = scenario_path(options.scenario)
+    scenarios = with_true_machine(load_scenarios(path), options.true_machine)
     out = options.out or OUT / options.scenario.stem
     make_folder(out)
     results = run_all(scenarios, out, build=options.build, instruction_ns=options.instruction_ns,
-                      progress=lambda line: print(line, flush=True))
+                      progress=lambda line: print(line, flush=True), source=path)
     if scenarios[0].position:
         from salient.experiments.plots import plot_position  # matplotlib, for these alone
 

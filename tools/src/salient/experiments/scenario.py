@@ -51,7 +51,8 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -315,11 +316,11 @@ def _position_summary(result: RunResult) -> dict[str, Any]:
 
 
 def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build: str = "host",
-            instruction_ns: int | None = None,
-            progress: Callable[[str], None] = lambda line: None) -> dict[str, RunResult]:
+            instruction_ns: int | None = None, progress: Callable[[str], None] = lambda line: None,
+            source: Path | None = None) -> dict[str, RunResult]:
     """Runs the scenarios of one file, each into out_dir/CONTROLLER, and writes out_dir/results.json. build,
-    instruction_ns: see BenchConfig."""
-    check_parameters(scenarios, build)
+    instruction_ns: see BenchConfig; source: see check_parameters."""
+    check_parameters(scenarios, build, source)
     results = {}
     for scenario in scenarios:
         progress(f"{scenario.name}: {scenario.controller}, {scenario.duration_s:g} s of virtual time")
@@ -329,16 +330,29 @@ def run_all(scenarios: list[Scenario], out_dir: Path, can: str = "local", build:
     return results
 
 
-def check_parameters(scenarios: list[Scenario], build: str) -> None:
+def check_parameters(scenarios: list[Scenario], build: str, source: Path | None = None) -> None:
     """UsageError before the first run: a parameter that the drive does not know or would refuse, parameters that
-    contradict each other or the supply, or what the test bench would refuse (check_bench)."""
+    contradict each other or the supply, or what the test bench would refuse (check_bench). source: the file that has
+    the values, which the line names."""
     for scenario in scenarios:
-        check_bench(scenario)
         config = _bench_config(scenario, None, build)
-        _check_parameter_names(scenario, config)
-        values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
-        supply_V = load_machine(machine_path(scenario.plant)).supply_voltage_V
-        check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))
+        with _named(source):
+            check_bench(scenario)
+            _check_parameter_names(scenario, config)
+            values = {row.name: row.default for row in parameter_table(config)} | scenario.parameters
+            supply_V = load_machine(machine_path(scenario.plant)).supply_voltage_V
+            check_consistency(values, scenario.parameters, scenario.bench.get("supply_voltage_V", supply_V))
+
+
+@contextmanager
+def _named(source: Path | None) -> Iterator[None]:
+    """A UsageError of a value of a file names the file."""
+    try:
+        yield
+    except UsageError as error:
+        if source is None:
+            raise
+        raise UsageError(f"{source}: {error}") from None
 
 
 def check_bench(scenario: Scenario) -> None:
@@ -486,7 +500,8 @@ def load_scenarios(path: Path) -> list[Scenario]:
         raise UsageError(f"{path}: {error}") from None
     machine = _machine_of(path, file.machine)
     true_machine = None if file.true_machine is None else _machine_of(path, file.true_machine)
-    machine_image(machine, true_machine)  # checks them
+    with _named(path):
+        machine_image(machine, true_machine)  # checks them
     for step in file.speed:
         _check_reference(path, machine, "DRIVE_COMMAND.speed_reference_rpm", "speed.value_rpm", step.value_rpm)
     for step in file.torque:
@@ -510,10 +525,8 @@ def load_scenarios(path: Path) -> list[Scenario]:
         "record": None if file.record is None else Record(**file.record.model_dump()),
     }
     scenarios = [Scenario(controller=controller, **common) for controller in file.controllers]
-    try:
+    with _named(path):
         check_bench(scenarios[0])
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
     return scenarios
 
 
@@ -536,10 +549,8 @@ def _load_profile_of(path: Path, name: str) -> str:
     """Name or path of the load profile of a scenario file; it is read to be checked."""
     relative = path.parent / name
     profile = str(relative.resolve()) if relative.suffix == ".csv" else name
-    try:
+    with _named(path):
         read_load_profile(load_profile_path(profile))
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
     return profile
 
 

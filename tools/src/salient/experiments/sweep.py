@@ -125,7 +125,11 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
         columns = dict(zip(axes, combination, strict=True))
         found.append(Run({**columns, "machine": Path(columns["machine"]).stem}, _scenario(base[0], columns), program))
     checked = {repr(replace(of.scenario, seed=base[0].seed)): replace(of.scenario, seed=base[0].seed) for of in found}
-    check_parameters(list(checked.values()), "host")
+    try:
+        check_parameters(list(checked.values()), "host")
+    except UsageError:
+        check_parameters(base[:1], "host", scenario_path(options.scenario))  # a mistake of the file, or of an option
+        raise
     return found
 
 

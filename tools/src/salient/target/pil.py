@@ -98,7 +98,7 @@ def summary(profiles: Mapping[str, IsrProfile], target: str) -> str:
 
 def _run_scenario(path: Path, out: Path, target: str, true_machine: str | None) -> int:
     scenarios = with_true_machine(load_scenarios(scenario_path(path)), true_machine)
-    check_parameters(scenarios, target)
+    check_parameters(scenarios, target, scenario_path(path))
     make_folder(out)
     results: dict[str, RunResult] = {}
     profiles: dict[str, IsrProfile] = {}
