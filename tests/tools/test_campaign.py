@@ -343,7 +343,9 @@ def test_a_mistake_is_one_line_that_names_it(arguments: tuple[str, ...], message
 
 def test_a_folder_without_a_failure_is_named(tmp_path: Path) -> None:
     done = salient("replay", tmp_path)
-    assert done.returncode == 2 and f"{tmp_path}/failure.json: not the note of a failure" in done.stderr
+    assert (done.returncode, done.stdout, done.stderr) == (
+        2, "", f"salient: {tmp_path}/failure.json: not the note of a failure (No such file or directory); give a seed "
+        "or the folder of a failure that a campaign has left\n")
 
 
 @pytest.mark.in_turns

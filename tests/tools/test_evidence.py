@@ -154,6 +154,13 @@ def test_a_wrong_claim_is_one_error_that_names_it(old, new, error, tmp_path):
     assert str(raised.value) == f"{path}: {error}"
 
 
+def test_claims_that_are_not_there_are_one_error_that_names_them_once(tmp_path):
+    path = tmp_path / "evidence.toml"
+    with pytest.raises(UsageError) as raised:
+        read_claims(path)
+    assert str(raised.value) == f"{path}: No such file or directory"
+
+
 def test_the_page_shows_each_state(repository, tmp_path):
     (claim,) = read_claims(repository / "evidence.toml")
     verdicts = [evidence.Verdict(claim, state, state) for state in (GOOD, MISSING, FAILING, STALE)]

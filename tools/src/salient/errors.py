@@ -30,6 +30,13 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN_MAX else f"{text[:SHOWN_MAX]}..."
 
 
+def reason(error: Exception) -> str:
+    """Text of an error in a line that names the file already, as an OSError does by itself."""
+    if isinstance(error, KeyError):
+        return f"no {error}"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
+
+
 NAMES_MAX = 8
 """As many names a message lists in full."""
 _NEAREST = 3

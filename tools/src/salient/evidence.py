@@ -35,7 +35,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from salient.errors import RunFailed, UsageError
+from salient.errors import RunFailed, UsageError, reason
 from salient.pages import write_page
 from salient.paths import OUT, ROOT, make_folder
 
@@ -89,7 +89,7 @@ def read_claims(path: Path) -> list[Claim]:
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8")).get("claim", [])
     except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: {error}") from None
+        raise UsageError(f"{path}: {reason(error)}") from None
     claims = []
     for number, table in enumerate(tables, start=1):
         try:

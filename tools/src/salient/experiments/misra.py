@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from salient.builder import build_preset
-from salient.errors import RunFailed, UsageError, exit_code
+from salient.errors import RunFailed, UsageError, exit_code, reason
 from salient.experiments import tasks
 from salient.experiments.campaign.runner import processor_s
 from salient.paths import BUILD, OUT, ROOT, build_lock, from_root
@@ -90,7 +90,7 @@ def deviations(path: Path = TABLE) -> list[Deviation]:
         found = [Deviation(entry["rule"], entry["reason"].strip(), entry["findings"])
                  for entry in tomllib.loads(path.read_text(encoding="utf-8"))["deviation"]]
     except (OSError, tomllib.TOMLDecodeError, KeyError, AttributeError) as error:
-        raise UsageError(f"{path.name}: no table of deviations: {error}") from None
+        raise UsageError(f"{path.name}: no table of deviations: {reason(error)}") from None
     places = Counter((each.rule, scope) for each in found for scope in each.findings)
     for each in found:
         if not each.reason or not each.findings:

@@ -30,7 +30,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from salient.errors import UsageError, exit_code
+from salient.errors import UsageError, exit_code, reason
 from salient.experiments import tasks
 from salient.experiments.campaign.failure import classes, save
 from salient.experiments.campaign.runner import Programs, commit, processor_s, run_world, run_worlds
@@ -101,7 +101,7 @@ def bugs(path: Path = TABLE) -> tuple[Bug, ...]:
             for name, old, new, *by in group["bugs"]:
                 found.append(Bug(name, group["file"], old, new, tuple(by[0] if by else group["found_by"]), path))
     except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError) as error:
-        raise UsageError(f"{path.name}: no table of bugs: {error}") from None
+        raise UsageError(f"{path.name}: no table of bugs: {reason(error)}") from None
     names = [bug.name for bug in found]
     for bug in found:
         if names.count(bug.name) > 1 or not bug.found_by:

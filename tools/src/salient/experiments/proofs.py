@@ -34,7 +34,7 @@ from typing import Any
 
 import lizard
 
-from salient.errors import UsageError, exit_code
+from salient.errors import UsageError, exit_code, reason
 from salient.experiments import planted, tasks
 from salient.experiments.campaign.runner import commit, processor_s
 from salient.paths import BUILD, OUT, ROOT, build_lock
@@ -84,7 +84,7 @@ def proofs(path: Path = TABLE) -> list[Proof]:
                                planted.Bug(entry["name"], file, old, new, (), path), entry.get("unwind", 1),
                                entry.get("slow", False)))
     except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError, AttributeError) as error:
-        raise UsageError(f"{path.name}: no table of proofs: {error}") from None
+        raise UsageError(f"{path.name}: no table of proofs: {reason(error)}") from None
     known = set(functions())
     for proof in found:
         if unknown := sorted(set(proof.functions) - known):

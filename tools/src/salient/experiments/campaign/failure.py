@@ -18,7 +18,7 @@ from salient.bench.programs import EmulatorError
 from salient.bench.session import SessionError
 from salient.bus.clock import open_bus
 from salient.config import BenchConfig
-from salient.errors import UsageError
+from salient.errors import UsageError, reason
 from salient.experiments.campaign import names
 from salient.experiments.campaign.machines import files
 from salient.experiments.campaign.runner import ALL_EVENTS, FAULTS, KINDS, Programs, Result, run_world, world
@@ -201,5 +201,5 @@ def load(folder: Path) -> Failure:
         return Failure(int(note["seed"]), int(note["kept"], 16), _kind(note["kind"]),
                        None if bug is None else str(bug))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise UsageError(f"{path}: not the note of a failure ({error}); give a seed or the folder of a failure that a "
-                         "campaign has left") from None
+        raise UsageError(f"{path}: not the note of a failure ({reason(error)}); give a seed or the folder of a "
+                         "failure that a campaign has left") from None
