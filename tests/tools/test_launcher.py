@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from can import CanOperationError
 
 from salient import __main__ as salient_main
+from salient import kept_files
 from salient.bench.drive import DriveError, OtherDatabase
 from salient.bench.faults import FaultError
 from salient.bench.programs import EmulatorError
 from salient.bench.rig import RigError
 from salient.bench.session import SessionError
+from salient.cli import make_parser
 from salient.machine.path import MachineError
 from salient.paths import MACHINES, ROOT
 
@@ -190,6 +194,83 @@ def test_machine_file_that_is_read_stays(salient_without_build, tmp_path, option
     assert path.read_text() == text
     assert_usage_error(salient_without_build("tab", "--machine", path, "--out", path), "--out", "would be overwritten")
     assert path.read_text() == text
+
+
+def _actions(parser: argparse.ArgumentParser, name: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Commands, with their actions, and their parsers."""
+    below = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    for action in below:
+        for word, each in action.choices.items():
+            yield from _actions(each, f"{name} {word}".strip())
+    if not below:
+        yield name, parser
+
+
+PARSERS = dict(_actions(make_parser()))
+_PLACES = ("FILE", "DIR", "TOML")
+_VALUES = {"machine": "saturating", "scenario": "start_600", "file": "other.toml", "value": "1", "what": "1"}
+"""For arguments that a command needs."""
+
+
+def _file_options(command: str) -> list[argparse.Action]:
+    return [action for action in PARSERS[command]._actions
+            if any(place in str(action.metavar) for place in _PLACES)]
+
+
+def _pairs() -> Iterator[tuple[str, str, str]]:
+    """Command, option with a file that is read, option of one that is written, or a file in the folder --out."""
+    for command in PARSERS:
+        names = {action.dest for action in _file_options(command)}
+        written = kept_files.WRITTEN.get(command, ())
+        for source in sorted(names & set(kept_files.READ) - set(written)):
+            for target in (*written, *kept_files.FOLDERS.get(command, ())):
+                yield command, source, target
+
+
+def test_every_option_with_a_file_is_known_as_read_or_written():
+    """A command that writes a file names it in kept_files, whose check is before the command."""
+    assert set(kept_files.WRITTEN) | set(kept_files.FOLDERS) <= set(PARSERS)
+    for command in PARSERS:
+        written = {*kept_files.WRITTEN.get(command, ()), *(["out"] if command in kept_files.FOLDERS else [])}
+        for action in _file_options(command):
+            known = action.dest in {*written, *kept_files.READ} or (command, action.dest) in _READS_NOTHING
+            assert known, f"{command} --{action.dest}"
+
+
+_READS_NOTHING = {(command, "out") for command in ("campaign", "replay", "wheel", "docs", "machine")}
+"""Folders of commands without a file that is read; `machine --import` looks at its own."""
+
+
+@pytest.mark.parametrize(("command", "source", "target"), list(_pairs()))
+@pytest.mark.parametrize("link", [os.link, os.symlink])
+def test_no_command_overwrites_what_it_reads(salient_without_build, tmp_path, command, source, target, link):
+    is_folder = target in kept_files.FOLDERS.get(command, ())
+    mine = tmp_path / "mine.toml"
+    mine.write_text("[magnetics]\nfile = 'map.csv'\n")
+    other = tmp_path / "out" / target.replace("*", "x") if is_folder else tmp_path / "other.csv"
+    if (command, target) == ("identify", "out"):
+        other = tmp_path / "other.toml"
+    other.parent.mkdir(parents=True, exist_ok=True)
+    link(mine, other)
+    values = {source: mine, "out" if is_folder else target: tmp_path / "out" if is_folder else other}
+    line: list[object] = command.split()
+    for action in PARSERS[command]._actions:
+        if action.dest in values or action.required or action.dest == "scenario":
+            value = values.get(action.dest, _VALUES.get(action.dest))
+            line += [*action.option_strings[:1], value]
+    done = salient_without_build(*line)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.endswith(f": {mine} is read, and would be overwritten; name another file\n"), done.stderr
+    assert mine.read_text() == other.read_text() == "[magnetics]\nfile = 'map.csv'\n"
+
+
+def test_the_map_of_a_machine_file_is_read(salient_without_build, tmp_path):
+    path = machine_file(tmp_path, "mine", "", "")
+    path.write_text('[magnetics]\nform = "map"\nfile = "map.csv"\n')
+    (tmp_path / "map.csv").write_text("a")
+    assert_usage_error(salient_without_build("machine", path, "--json", "map.csv"), "--json map.csv",
+                       "would be overwritten")
+    assert (tmp_path / "map.csv").read_text() == "a"
 
 
 def test_import_writes_nothing_outside_its_folder(salient_without_build, tmp_path):

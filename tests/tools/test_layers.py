@@ -47,7 +47,7 @@ PYTHON_LAYERS = (
     "salient.cmake",
     "salient.benchmark.switching_pattern", "salient.reference", "salient.target", "salient.benchmark",
     "salient.documents", "salient.evidence",
-    "salient.__main__",
+    "salient.kept_files", "salient.__main__",
 )  # fmt: skip
 
 

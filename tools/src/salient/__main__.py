@@ -11,8 +11,9 @@ from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import RunFailed, UsageError, exit_code
 from salient.guard import removes
+from salient.kept_files import keep_read_files
 from salient.light_can import without_mf4
-from salient.paths import BUILD, OUT, keep_sources, make_folder, scenario_path
+from salient.paths import BUILD, OUT, make_folder, scenario_path
 
 
 def main() -> int:
@@ -37,6 +38,7 @@ def _run_command(options: argparse.Namespace) -> int:
     make_parser().parse_args(namespace=options)
     if getattr(options, "can", None) == "auto":
         options.can = _automatic_can()
+    keep_read_files(options)
     try:
         return _COMMANDS[options.command](options)
     except Exception as error:
@@ -191,13 +193,8 @@ def _sweep(options: argparse.Namespace) -> int:
 
 
 def _machine(options: argparse.Namespace) -> int:
-    from salient.machine.path import machine_path
     from salient.machine.report import run
 
-    read = [path for path in (machine_path(options.machine), options.table) if path is not None]
-    for name in ("json", "a2l", "eds", "dbc"):
-        if written := getattr(options, name):
-            keep_sources(f"--{name} {written}", [written], *read)
     code = run(options.machine, options.out, options.json, options.dbc, options.node, options.table)
     if options.a2l is not None:
         from salient.bench.a2l import write_a2l

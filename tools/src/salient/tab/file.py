@@ -20,7 +20,7 @@ from salient.errors import UsageError
 from salient.machine.cache import machine_image
 from salient.machine.image import FLUX_MAP, HEADER
 from salient.machine.path import machine_path
-from salient.paths import BUILD, TAB_PAGE, keep_sources
+from salient.paths import BUILD, TAB_PAGE
 from salient.tab.build_id import build_id
 from salient.tab.data import bundled_machines, machine_data, shared_data
 from salient.version import VERSION
@@ -54,8 +54,6 @@ def tab_html(machine: str | None = None) -> str:
 
 def run(path: Path, machine: str | None) -> int:
     """Writes the file."""
-    if machine is not None:
-        keep_sources(f"--out {path}", [path], machine_path(machine))
     text = tab_html(machine).encode()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
