@@ -145,8 +145,8 @@ def tools_alone(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "suffix", "expected"), [
-    ("openocd", "elf", "program {%s} verify reset exit"),
-    ("openocd", "bin", "program {%s} 0x08000000 verify reset exit"),
+    ("openocd", "elf", "program %s verify reset exit"),
+    ("openocd", "bin", "program %s 0x08000000 verify reset exit"),
     ("st-flash", "hex", "ihex\nwrite\n%s"), ("st-flash", "bin", "write\n%s\n0x08000000"),
 ])
 def test_flash_calls_the_program_that_is_there(monkeypatch, capsys, built, tmp_path, name, suffix, expected):
@@ -184,7 +184,29 @@ def test_flash_refuses_what_is_no_image(monkeypatch, capsys, tmp_path, name, con
 
 def test_flash_names_a_missing_file(monkeypatch, capsys, tmp_path):
     assert salient(monkeypatch, "board", "flash", tmp_path / "none.hex") == 2
-    assert capsys.readouterr().err == f"salient: {tmp_path}/none.hex: No such file or directory\n"
+    assert capsys.readouterr().err == f"salient: {tmp_path}/none.hex: no such file\n"
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".hex", ".elf"])
+def test_flash_waits_for_no_pipe_and_reads_no_device(monkeypatch, capsys, tmp_path, suffix):
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"zero{suffix}").symlink_to("/dev/zero")
+    for name in ("pipe", "zero"):
+        assert salient(monkeypatch, "board", "flash", tmp_path / f"{name}{suffix}") == 2
+        assert capsys.readouterr().err == f"salient: {tmp_path}/{name}{suffix}: not a file\n"
+
+
+@pytest.mark.parametrize("name", ["a b.bin", "a}b.bin", "a{b.bin", "a;[exit]$x.bin", 'a"#b.bin', "a\\b.bin",
+                                  "a\nb.bin"])
+def test_a_name_of_a_file_is_one_word_of_openocd(monkeypatch, capsys, tmp_path, name):
+    """By the rules of Tcl, whose language OpenOCD has: a sign after a backslash is itself."""
+    tools_alone(monkeypatch, tmp_path)
+    program(tmp_path, "openocd", "exit 0")
+    (tmp_path / name).write_bytes(struct.pack("<II", 0x20010000, 0x08000101))
+    assert salient(monkeypatch, "board", "flash", tmp_path / name) == 0
+    word = (tmp_path / "openocd.arguments").read_text().split("\nprogram ")[1].split(" 0x08000000")[0]
+    assert re.fullmatch(r'(\\.|[^\\{}\[\]"$;\s#])+', word)
+    assert re.sub(r"\\(.)", lambda found: {"n": "\n"}.get(found[1], found[1]), word) == str(tmp_path / name)
 
 
 def test_pins_are_used_once_and_in_the_header():

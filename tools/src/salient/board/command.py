@@ -18,6 +18,7 @@ from salient.elf import ElfImage
 from salient.errors import RunFailed, UsageError
 from salient.machine.path import machine_path
 from salient.paths import BUILD, ROOT, build_lock, from_root, make_folder
+from salient.toml_file import TextFileError, read_bytes
 
 PRESET = "stm32g4"
 PHASES_MAX = 4
@@ -29,6 +30,10 @@ CAN_QUANTA = 10
 _PARTS = ("drive_codec", "salient_firmware")
 _OPENOCD = ("-f", "board/st_nucleo_g4.cfg")
 SUFFIXES = (".elf", ".hex", ".bin")
+_TCL = {letter: f"\\{letter}" for letter in "{}[]\"\\$; #"} | {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+"""Characters with a meaning in OpenOCD's language, as themselves."""
+_FILE_BYTES_MAX = 100_000_000
+"""Size of an ELF file with its debug information; the flash takes less."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -105,7 +110,7 @@ def flash(file: Path) -> int:
     check_image(file)
     if shutil.which("openocd"):
         place = f" 0x{FLASH_BEGIN:08x}" if file.suffix == ".bin" else ""
-        command = ["openocd", *_OPENOCD, "-c", f"program {{{file.resolve()}}}{place} verify reset exit"]
+        command = ["openocd", *_OPENOCD, "-c", f"program {_tcl_word(file.resolve())}{place} verify reset exit"]
     elif shutil.which("st-flash"):
         if file.suffix == ".elf":
             raise UsageError(f"{file}: st-flash writes no ELF file; must be the .hex or the .bin beside it")
@@ -124,11 +129,19 @@ def flash(file: Path) -> int:
     return 0
 
 
+def _tcl_word(path: Path) -> str:
+    """A path as a word of OpenOCD's language, whatever characters it has."""
+    return "".join(_TCL.get(letter, letter) for letter in str(path))
+
+
 def check_image(file: Path) -> None:
     """Refuses what is no image of this board. UsageError."""
     if file.suffix not in SUFFIXES:
         raise UsageError(f"{file}: must be a file {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} of board build")
-    vectors = _first_bytes(file)
+    try:
+        vectors = _first_bytes(file, read_bytes(file, _FILE_BYTES_MAX))
+    except TextFileError as error:
+        raise UsageError(f"{file}: {error}") from None
     stack, start = struct.unpack("<II", vectors) if len(vectors) == 8 else (0, 0)
     in_ram = RAM_BEGIN < stack <= RAM_BEGIN + RAM_BYTES and stack % 8 == 0
     if not in_ram or not (FLASH_BEGIN <= start < FLASH_BEGIN + FLASH_BYTES and start & 1):
@@ -136,10 +149,10 @@ def check_image(file: Path) -> None:
                          f"{vectors.hex() or 'nothing'}")
 
 
-def _first_bytes(file: Path) -> bytes:
+def _first_bytes(file: Path, content: bytes) -> bytes:
     """The first two vectors, as far as the file has them at the begin of the flash."""
     if file.suffix == ".bin":
-        return file.read_bytes()[:8]
+        return content[:8]
     if file.suffix == ".elf":
         try:
             return ElfImage(file).read(FLASH_BEGIN, 8)
@@ -147,7 +160,7 @@ def _first_bytes(file: Path) -> bytes:
             return b""
     base = 0
     try:
-        for line in file.read_text(encoding="ascii").splitlines():
+        for line in content.decode("ascii").splitlines():
             record = bytes.fromhex(line.removeprefix(":"))
             if record[3] == 4:  # upper half of the addresses that follow
                 base = int.from_bytes(record[4:6], "big") << 16
