@@ -14,9 +14,10 @@ import pytest
 
 from salient.__main__ import main
 from salient.bench import parameter_file
-from salient.bench.emulator import EmulatorProcess
+from salient.bench.emulator import EmulatorProcess, parameter_table
 from salient.bench.session import Session
 from salient.config import BenchConfig
+from salient.errors import UsageError
 from salient.machine.parameter_table import CHOICES, read_table
 
 
@@ -31,6 +32,20 @@ def can(tmp_path: Path) -> Iterator[str]:
 def parameters(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "salient", "parameters", *map(str, arguments)], text=True,
                           capture_output=True, stdin=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize(("text", "mistake"), [
+    (f"current_trip_A = 1{'0' * 400}", "current_trip_A: 100000"), (f"controller = 1{'0' * 400}", "controller: 100000"),
+    ("current_trip_A = inf", "current_trip_A: inf: must be"), ("controller = 0.5", "controller: 0.5: must be "),
+    ("current_trip_A = nan", "current_trip_A: nan: must be a number from 1.0 to 79.0 A"),
+])  # fmt: skip
+def test_a_number_that_no_parameter_has_is_a_mistake_of_the_file(tmp_path: Path, text: str, mistake: str):
+    file = tmp_path / "drive.toml"
+    file.write_text(text)
+    rows = {row.name: row for row in parameter_table(BenchConfig())}
+    with pytest.raises(UsageError) as caught:
+        parameter_file.read(file, rows)
+    assert str(caught.value).startswith(f"{file}: {mistake}") and "\n" not in str(caught.value)
 
 
 @pytest.mark.in_turns

@@ -38,7 +38,7 @@ from salient.machine.parameter_table import CHOICES, value_name
 from salient.paths import ROOT
 from salient.view import link as view_link
 from salient.view.command import LogFeed
-from salient.view.commands import COMMANDS, Commander
+from salient.view.commands import COMMANDS, Commander, Malformed, check_command
 from salient.view.description import EXTENDED, description
 from salient.view.frames import FrameStore
 from salient.view.server import PAGES_MAX
@@ -464,11 +464,18 @@ MALFORMED = [
     '{"n": 1, "name": "speed_reference", "args": {"rpm": "600"}}',
     '{"n": 1, "name": "speed_reference", "args": {"rpm": 1e999}}',
     '{"n": 1, "name": "speed_reference", "args": {"rpm": true}}',
+    f'{{"n": 1, "name": "speed_reference", "args": {{"rpm": 1{"0" * 400}}}}}', f'{{"shown": 1{"0" * 400}}}',
     '{"n": 1, "name": "speed_reference", "args": {"rpm": 600, "more": 1}}',
     '{"n": 1, "name": "__init__", "args": {}}', '{"n": "1", "name": "stop", "args": {}}',
     '{"n": 1, "name": ["stop"], "args": {}}', '{"n": 1, "name": "stop", "args": []}',
     '{"n": 1, "name": "set_parameters", "args": {"values": {"torque_max_Nm": "9"}}}', b"\0\1\2",
 ]
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**400), float("nan"), float("inf")])
+def test_a_number_that_no_float_has_is_malformed(number):
+    with pytest.raises(Malformed):
+        check_command("speed_reference", {"rpm": number})
 
 
 @pytest.mark.in_turns

@@ -118,9 +118,9 @@ def _mistake(name: str, value: object, rows: dict[str, ParameterRow]) -> str:
     row = rows[name]
     kind = "" if name in CHOICES else "a number from "
     allowed = f"{name}: {shown(value)}: must be {kind}{_allowed(row)} {row.unit}".rstrip()
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or (name in CHOICES and value != value // 1):
         return allowed
-    lsb = math.ldexp(1.0, -row.fraction_bits)
+    lsb = math.ldexp(1.0, -row.fraction_bits)  # compared as it is: no float may have a whole number of a file
     return "" if row.minimum - lsb / 2 <= value <= row.maximum + lsb / 2 else allowed
 
 
