@@ -131,7 +131,7 @@ def test_every_tool_finds_the_machine_of_a_drive(other_drive, tmp_path, capsys):
 def test_every_tool_refuses_another_machine_than_stated_in_one_line(other_drive, nothing_kept, tmp_path, tool):
     record(other_drive, tmp_path / "x.blf", 0.15, None)
     options = argparse.Namespace(can=other_drive, machine="saturating", node=0, action="save", list=False,
-                                 signals=[], file=tmp_path / "p.toml",
+                                 signals=[], trigger=None, file=tmp_path / "p.toml",
                                  out=tmp_path / "scope", dbc=[])
     runs = {
         "monitor": lambda machine: watch(other_drive, machine),

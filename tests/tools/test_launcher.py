@@ -273,6 +273,28 @@ def test_the_map_of_a_machine_file_is_read(salient_without_build, tmp_path):
     assert (tmp_path / "map.csv").read_text() == "a"
 
 
+@pytest.mark.parametrize("second", ["./one", "link"])
+def test_no_file_is_written_twice(salient_without_build, tmp_path, second):
+    (tmp_path / "link").symlink_to("one")
+    assert_usage_error(salient_without_build("machine", "saturating", "--json", "one", "--eds", second),
+                       f"--eds {Path(second)}: --json one writes the same file; name another one")
+    assert not (tmp_path / "one").exists()
+
+
+def test_a_name_too_long_for_files_is_the_mistake_of_its_machine_file(salient_without_build, tmp_path):
+    path = machine_file(tmp_path, "mine", "", "")
+    path.write_text(path.read_text().replace('name = "mine"', f'name = "{300 * "x"}"'))
+    assert_usage_error(salient_without_build("machine", path), f"{path}: name: 'xxx", "underscores, at most 100")
+
+
+@pytest.mark.parametrize(("arguments", "text"), [
+    (("--trigger", "speed_rpm > 5"), "--trigger speed_rpm > 5: only with --signals"),
+    (("--signals", "speed_rpm", "--dbc", "a.dbc"), "--dbc a.dbc: not with --signals"),
+])
+def test_scope_ignores_no_option(salient_without_build, arguments, text):
+    assert_usage_error(salient_without_build("scope", "--can", "unix:none", *arguments), text)
+
+
 def test_import_writes_nothing_outside_its_folder(salient_without_build, tmp_path):
     """A name is a part of paths before the machine file that has it is checked."""
     path = machine_file(tmp_path, "mine", "", "")

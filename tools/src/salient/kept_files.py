@@ -27,10 +27,16 @@ FOLDERS = {"run": _RUN, "pil": _RUN, "demo": ("results.json", "report.html"), "s
 
 
 def keep_read_files(options: argparse.Namespace) -> None:
-    """UsageError before anything is read: the command would overwrite or remove a file that it reads."""
+    """UsageError before anything is read: the command would overwrite or remove a file that it reads, or write one
+    twice."""
     command = " ".join(filter(None, (options.command, getattr(options, "action", None))))
     read: list[Path] | None = None
+    earlier: dict[Path, str] = {}
     for option, paths in _written(command, options):
+        for path in {path.resolve() for path in paths}:
+            if path in earlier:
+                raise UsageError(f"{option}: {earlier[path]} writes the same file; name another one")
+            earlier[path] = option
         if there := [path for path in paths if path.exists()]:
             read = list(_read(command, options)) if read is None else read
             keep_sources(option, there, *read)

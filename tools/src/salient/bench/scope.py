@@ -42,7 +42,11 @@ def run(options: argparse.Namespace) -> int:
     if options.list:
         return _list(options.machine)
     if options.signals:
+        if options.dbc:
+            raise UsageError(f"--dbc {options.dbc[0]}: not with --signals, whose table has the drive's variables")
         return _record(options)
+    if options.trigger is not None:
+        raise UsageError(f"--trigger {options.trigger}: only with --signals; without, it is the last fault")
     if options.out.suffix in FORMATS:
         raise UsageError(f"--out {options.out}: without --signals it is a folder")
     others = load_databases(options.dbc, options.node)

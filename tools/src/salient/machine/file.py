@@ -140,9 +140,13 @@ MAGNETICS: dict[str, type[Table]] = {"map": MapMagnetics} | {
 """The table [magnetics] by its form."""
 
 
+_NAME_MAX = 100
+"""Characters of a name, which the names of files have within them."""
+
+
 class Named(Table):
-    name: Annotated[str, checked("a word of letters, digits and underscores",
-                                 lambda name: name.isidentifier() and name.isascii())]
+    name: Annotated[str, checked(f"a word of letters, digits and underscores, at most {_NAME_MAX}",
+                                 lambda name: name.isidentifier() and name.isascii() and len(name) <= _NAME_MAX)]
 
 
 class MachineFile(Named):
