@@ -17,8 +17,8 @@ typedef struct {
     machine_tables_t built_in; /* of the image; with config.stored_tables */
 } host_drive_t;
 
-/* The configuration of drive `number` of the bench by the options of the command line. One that is alone and whose memory
- * is kept (--memory) takes tables of another machine: drives of a bench share them. */
+/* The configuration of drive `number` of the bench by the options of the command line. One that is alone and whose
+ * memory is kept (--memory) takes tables of another machine: drives of a bench share them. */
 drive_config_t host_drive_config(const options_t *options, unsigned number);
 
 /* Starts the firmware of a drive on the board of its rig; `firmware` is then for rig_join. False when the drive rejects

@@ -120,7 +120,7 @@ static void respond(message_t *response, const uint8_t *bytes, uint8_t count) {
 static xcp_error_t connect(xcp_t *xcp, const xcp_context_t *context, message_t *response) {
     end_session(xcp);
     xcp->connected = true;
-    const uint8_t bytes[] = {resources_of(context), COMM_MODE,        MESSAGE_BYTES,   MESSAGE_BYTES, 0,
+    const uint8_t bytes[] = {resources_of(context), COMM_MODE,       MESSAGE_BYTES, MESSAGE_BYTES, 0,
                              PROTOCOL_VERSION,      PROTOCOL_VERSION};
     respond(response, bytes, sizeof bytes);
     return XCP_ERROR_NONE;

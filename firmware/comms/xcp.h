@@ -15,8 +15,8 @@
  *               programmed (comms/xcp_program.h), where the port can load them (storage/table_store.h)
  *
  * Reading is free. Measuring, which takes time of the interrupts, and the triggered buffer need resource DAQ, writing a
- * parameter resource CAL/PAG, programming tables resource PGM. Each is unlocked by a seed, of which the key is every bit
- * inverted, as the key of the arming: a random or recorded frame opens nothing. A seed serves one attempt within
+ * parameter resource CAL/PAG, programming tables resource PGM. Each is unlocked by a seed, of which the key is every
+ * bit inverted, as the key of the arming: a random or recorded frame opens nothing. A seed serves one attempt within
  * ARMING_RESPONSE_MAX_US. All are locked again by the end of the session: DISCONNECT, CONNECT, a wrong key, bus-off, or
  * XCP_SILENT_US without a command. A master that measures sends no command: then XCP_SILENT_US locks all but DAQ.
  *
@@ -107,8 +107,8 @@ typedef struct {
     bool connected;
     uint8_t unlocked; /* XCP_RESOURCE_* */
     uint8_t seed_resource;
-    bool programming;           /* since PROGRAM_START */
-    bool pending;               /* a command waits for the memory */
+    bool programming;       /* since PROGRAM_START */
+    bool pending;           /* a command waits for the memory */
     uint32_t seed, seed_us; /* 0: none */
     uint32_t received_us;
     uint32_t address;    /* memory transfer address */

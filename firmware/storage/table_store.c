@@ -173,8 +173,8 @@ bool table_store_busy(const table_store_t *store) {
            (store->state == TABLE_STORE_TAKING && word_waits(store));
 }
 
-/* Writes a word of the tables: the first of those that wait. A place that the ring has passed over meanwhile has none of
- * those before it, which nobody has any more. */
+/* Writes a word of the tables: the first of those that wait. A place that the ring has passed over meanwhile has none
+ * of those before it, which nobody has any more. */
 static void write_waiting(table_store_t *store, hal_t *hal) {
     uint64_t word;
     (void)memcpy(&word, store->waiting, sizeof word);

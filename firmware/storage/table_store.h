@@ -2,15 +2,15 @@
  *
  * Two slots, the halves of a ring with one record each (storage/nvm_ring.h): tables are written into the slot that does
  * not have the newest, and are the newest when all of them are there. A cut, a damaged word or a transfer that is given
- * up leave those of before. Written in the background, one operation of the memory in a call of table_store_step and
- * none in RUN, as the parameters are (storage/nvm_store.h).
+ * up leave the tables of before. Written in the background, one operation of the memory in a call of table_store_step
+ * and none in RUN, as the parameters are (storage/nvm_store.h).
  *
- * The tables in effect are those of the start. A port that has them as a variable (MACHINE_TABLES_VARIABLE) calls
- * table_store_load before drive_init: the newest tables are taken when they are of this program and usable, else those
- * that it was built with. Usable means: no table leads an access out of its array, a divisor is not 0, every default of
- * a parameter is within its limits, the control rate is possible, and the sensors of current and voltage have the ranges
- * of the tables that the program was built with, because these belong to the board. What the values do to the motor is
- * up to who makes them: tools/src/salient/machine.
+ * The tables in effect are the ones of the start. A port that has them as a variable (MACHINE_TABLES_VARIABLE) calls
+ * table_store_load before drive_init: the newest tables are taken when they are of this program and usable, else the
+ * ones that it was built with. Usable means: no table leads an access out of its array, a divisor is not 0, every
+ * default of a parameter is within its limits, the control rate is possible, and the sensors of current and voltage
+ * have the ranges of the tables that the program was built with, because these belong to the board. What the values do
+ * to the motor is up to who makes them: tools/src/salient/machine.
  *
  * A record belongs to the program that wrote it (LAYOUT_HASH): another version falls back to its own tables.
  */
@@ -58,7 +58,7 @@ void table_store_init(table_store_t *store, const hal_t *hal);
 bool table_store_load(const hal_t *hal, uint32_t control_rate_hz, const machine_tables_t *built_in,
                       machine_tables_t *tables);
 
-/* False when a value of the tables is none that a drive with those of `built_in` can use. */
+/* True when a drive that was built with `built_in` can use the tables. */
 bool table_store_usable(const machine_tables_t *tables, const machine_tables_t *built_in, uint32_t control_rate_hz);
 
 /* Begins new tables; the next step erases. [background] */

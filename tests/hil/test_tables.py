@@ -1,4 +1,4 @@
-"""Machine tables written over CAN: from its next start on the drive is that of another machine file. [SR-61]"""
+"""Machine tables written over CAN: from its next start on the drive has the tables of another machine file. [SR-61]"""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def reset(bench) -> None:
 
 
 def ripple(bench) -> float:
-    """Of the motor's torque at 150 r/min with a load, K_t."""
+    """K_t of the motor's torque at 150 r/min with a load."""
     bench.drive.speed_reference_rpm = 150
     bench.run_for(0.3)
     bench.load_torque_Nm = 5
@@ -126,6 +126,14 @@ def test_tables_that_no_drive_can_use_leave_the_drive_with_those_of_the_program(
     assert own.drive.state == "ready"
 
 
+def program_uncleared(bench, wanted: bytes) -> None:
+    """The first bytes without PROGRAM_CLEAR."""
+    with connected(bench) as master:
+        master.programStart()
+        master.setMta(AREA_TABLES)
+        master.program(wanted[:6], 6, last=True)
+
+
 def test_a_transfer_that_is_given_up_can_be_begun_again_and_one_out_of_order_is_refused(own):
     wanted = tables.tables_of(OTHER)
     with connected(own) as master:
@@ -134,10 +142,8 @@ def test_a_transfer_that_is_given_up_can_be_begun_again_and_one_out_of_order_is_
         master.programClear(0, len(wanted))
         for at in range(0, 600, 6):
             master.program(wanted[at:at + 6], 6, last=True)
-    with pytest.raises(XcpError), connected(own) as master:
-        master.programStart()
-        master.setMta(AREA_TABLES)
-        master.program(wanted[:6], 6, last=True)  # nothing was cleared
+    with pytest.raises(XcpError):
+        program_uncleared(own, wanted)
     tables.write(own, wanted)
     reset(own)
     assert tables.read(own) == wanted

@@ -1,5 +1,5 @@
-"""The image of the board takes tables of another machine over CAN as the host executable does, and is bit-identical with
-it after. [SR-61]"""
+"""The image of the board takes tables of another machine over CAN as the host executable does, and has the same bits
+after. [SR-61]"""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ OTHER = "linear_cosine"
 @pytest.mark.in_turns
 def test_image_with_tables_from_its_memory_and_host_agree_in_frames_and_true_state(make_bench, tmp_path):
     wanted, made = tables.tables_of(OTHER), []
-    for number, options in enumerate(pair(programs.BOARD_CLOCK_MHZ)):
+    for number, own in enumerate(pair(programs.BOARD_CLOCK_MHZ)):
         recording = tmp_path / f"{number}.npy"
-        options = options | {"can": f"unix:{tmp_path}/{number}.sock", "memory": tmp_path / f"{number}.bin",
+        options = own | {"can": f"unix:{tmp_path}/{number}.sock", "memory": tmp_path / f"{number}.bin",
                              "telemetry_period_ms": 4, "true_machine": OTHER, "controller": "salient"}
         writer = make_bench(**options)
         tables.write(writer, wanted)

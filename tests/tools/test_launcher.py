@@ -44,7 +44,7 @@ def assert_usage_error(result, *expected_texts: str) -> None:
     ("arguments", "expected_texts"),
     [
         ([], ["COMMAND"]),
-        (["monitr"], ["unknown command 'monitr': the nearest of 23 are monitor, ", "tools/salient --help"]),
+        (["monitr"], ["unknown command 'monitr': the nearest of 24 are monitor, ", "tools/salient --help"]),
         (["fo'o"], ["unknown command 'fo'o': the nearest of "]),
         (["a\nb"], ["unknown command 'a b': the nearest of "]),
         (["--can", "unix:x", "sim"], ["unrecognised argument --can; must be one of --help, "]),

@@ -159,7 +159,8 @@ TEST_F(XcpProgram, a_command_that_waits_for_the_memory_is_answered_once_and_othe
     set_address(XCP_AREA_TABLES);
     EXPECT_EQ(send(clear()), bytes_t{});
     EXPECT_EQ(late(), bytes_t{});
-    for (const bytes_t &command : {bytes_t{0xFD}, clear(), part(0, 6), bytes_t{0xD2}, bytes_t{0xF6, 0, 0, 0, 0, 0, 0, 0}}) {
+    for (const bytes_t &command :
+         {bytes_t{0xFD}, clear(), part(0, 6), bytes_t{0xD2}, bytes_t{0xF6, 0, 0, 0, 0, 0, 0, 0}}) {
         EXPECT_EQ(send(command), failed(XCP_ERROR_BUSY));
     }
     EXPECT_EQ(send({0xFC}), failed(XCP_ERROR_SYNCHRONISED));

@@ -238,8 +238,7 @@ class LongRecord : public testing::Test {
     // Steps until the record is written or the power is lost; the number of steps.
     unsigned write(uint32_t number) {
         for (unsigned steps = 1;; steps++) {
-            const nvm_ring_result_t result =
-                nvm_ring_step(&ring, &hal, word_of(number, nvm_ring_payload_index(&ring)));
+            const nvm_ring_result_t result = nvm_ring_step(&ring, &hal, word_of(number, nvm_ring_payload_index(&ring)));
             if (result != NVM_RING_BUSY || hal.nvm.power_lost) {
                 return steps;
             }
@@ -284,7 +283,7 @@ TEST_F(LongRecord, a_cut_at_any_operation_of_any_kind_leaves_the_record_before_o
     write(2);
     const nvm_t before = hal.nvm;
     for (unsigned kind = 0; kind < NVM_CUT_KINDS; kind++) {
-        // Of the words in the middle, which are alike, every 19th.
+        // Every 19th of the words in the middle, which are alike.
         constexpr unsigned LAST = LONG_WORDS + LONG_PAGES;
         for (unsigned operation = 1; operation <= LAST; operation += operation < 8 || operation > LAST - 20 ? 1 : 19) {
             hal.nvm = before;

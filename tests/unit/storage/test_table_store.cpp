@@ -199,7 +199,7 @@ TEST_F(TableStore, a_cut_at_any_operation_leaves_the_tables_of_before_or_the_new
     }();
     EXPECT_EQ(operations, SLOT_PAGES + NVM_RING_OVERHEAD + 1 + (BYTES + 7) / 8);
     for (unsigned kind = 0; kind < NVM_CUT_KINDS; kind++) {
-        // Of the words in the middle, which are alike, every 97th.
+        // Every 97th of the words in the middle, which are alike.
         for (uint32_t cut = 1; cut <= operations; cut += cut < 10 || cut + 100 > operations ? 1 : 97) {
             hal->nvm = before;
             hal->nvm.random = cut;
@@ -339,9 +339,13 @@ TEST(UsableTables, those_of_the_program_are_and_none_with_a_value_that_leads_out
         {"row after the begin of its bin", [](auto &t) { t.angle_bin_row[0] = 1; }},
         {"row that ends before its bin", [](auto &t) { t.angle_bin_row[MACHINE_ANGLE_BINS - 1] = 0; }},
         {"default above its limit",
-         [](auto &t) { t.parameter_default[PARAMETER_CONTROLLER] = parameters_row(PARAMETER_CONTROLLER)->maximum + 1; }},
+         [](auto &t) {
+             t.parameter_default[PARAMETER_CONTROLLER] = parameters_row(PARAMETER_CONTROLLER)->maximum + 1;
+         }},
         {"default below its limit",
-         [](auto &t) { t.parameter_default[PARAMETER_CONTROLLER] = parameters_row(PARAMETER_CONTROLLER)->minimum - 1; }},
+         [](auto &t) {
+             t.parameter_default[PARAMETER_CONTROLLER] = parameters_row(PARAMETER_CONTROLLER)->minimum - 1;
+         }},
         {"control rate", [](auto &t) { t.control_rate_min_hz = RATE_HZ + 1; }},
         {"range of the current", [](auto &t) { t.current_range_q9 += 2; }},
         {"range of the current", [](auto &t) { t.current_range_q9 -= 2; }},
@@ -360,7 +364,7 @@ TEST(UsableTables, those_of_the_program_are_and_none_with_a_value_that_leads_out
 TEST(UsableTables, more_than_two_rows_that_begin_within_a_bin_are_not) {
     machine_tables_t tables = machine_tables;
     const uint32_t bin = 1u << MACHINE_ANGLE_BIN_BITS;
-    // Equidistant rows but for those of one bin.
+    // Equidistant rows but for the ones of one bin.
     const auto build = [&](unsigned within) {
         uint32_t start[MACHINE_ROWS];
         for (unsigned row = 0; row < MACHINE_ROWS - 1; row++) {

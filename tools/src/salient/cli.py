@@ -248,8 +248,8 @@ def make_parser() -> argparse.ArgumentParser:  # noqa: PLR0915 - a list of comma
                         help=f"{either(BOARD_ENCODERS)}: it counts to its absolute position at power-up, or is "
                         "absolute after its index has passed, before which no switch closes (default "
                         f"{BOARD_ENCODERS[0]})")
-    action.add_argument("--stored-tables", action="store_true", help="the drive takes the tables of another machine file "
-                        "over CAN (tables); its laws are not compiled for those of one machine")
+    action.add_argument("--stored-tables", action="store_true", help="the drive takes the tables of another machine "
+                        "file over CAN (tables); its laws are not compiled for one machine")
     action.add_argument("--out", type=Path, default=OUT / "board", metavar="DIR", help="folder (default %(default)s)")
     text = "write an image into the flash of a board, by OpenOCD or st-flash"
     action = actions.add_parser("flash", help=text, description=text, prog=f"{COMMAND} board flash")

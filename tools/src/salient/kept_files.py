@@ -16,7 +16,7 @@ MACHINES = ("machine", "true_machine")
 READ = (*MACHINES, "scenario", "table", "convert", "replay", "load_profile", "baseline", "dbc", "file")
 """Options with a file that is read."""
 WRITTEN = {"log": ("out",), "tab": ("out",), "identify": ("out",), "scope": ("out",), "evidence": ("out",),
-           "benchmark": ("json",), "sim": ("memory",), "machine": ("json", "a2l", "eds", "dbc"),
+           "benchmark": ("json",), "sim": ("memory",), "tables": ("out",), "machine": ("json", "a2l", "eds", "dbc"),
            "parameters save": ("file",)}
 """By command: options with a file that is written, be they of READ or not."""
 _RUN = ("results.json", "*/recording.npy", "*/can.blf", "*/can.log")
@@ -68,7 +68,8 @@ def _read(command: str, options: argparse.Namespace) -> Iterator[Path]:
             continue
         value: Any = getattr(options, name, None)
         for each in value if isinstance(value, list) else [] if value is None else [value]:
-            yield from _machine_files(str(each)) if name in MACHINES else _results(Path(each))
+            of_machine = name in MACHINES or (command, name) == ("tables", "file")
+            yield from _machine_files(str(each)) if of_machine else _results(Path(each))
 
 
 def _results(path: Path) -> list[Path]:

@@ -1,5 +1,5 @@
-"""Machine tables for a running drive, over CAN: `tools/salient tables`. From its next start on the drive is that of
-another machine file, without another program (firmware/storage/table_store.h).
+"""Machine tables for a running drive, over CAN: `tools/salient tables`. From its next start on the drive has another
+machine, without another program (firmware/storage/table_store.h).
 
 They are programmed by XCP (firmware/comms/xcp_program.h), so that any calibration tool that programs memories does it,
 too; `--out` writes the bytes for one.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from salient.bench.sampler import program_of
@@ -26,10 +26,12 @@ from salient.progress import Progress, steps_of
 if TYPE_CHECKING:
     from pyxcp.master.master import Master
 
+    from salient.machine.drive_data import DriveData
+
 PROGRAM_BYTES = 6
-"""Of a command, behind its code and count."""
+"""Data of a command, behind its code and count."""
 _ABSOLUTE = 0
-_OF_THE_BOARD = {
+_OF_THE_BOARD: dict[str, Callable[[DriveData], float]] = {
     "current range of the sensors": lambda data: data.adc_current_A,
     "voltage range of the sensor": lambda data: data.adc_voltage_V,
     "current trip of the comparators": lambda data: data.comparator_trip_A,
@@ -72,16 +74,17 @@ def check_board(present: str | None, file: str) -> None:
 
     if present is None:
         return
-    ours, theirs = (derive(load_machine(str(machine_path(name)))) for name in (file, present))
+    given, carried = (derive(load_machine(str(machine_path(name)))) for name in (file, present))
     for name, fact in _OF_THE_BOARD.items():
-        if fact(ours) != fact(theirs):
-            raise UsageError(f"{file}: {name} {fact(ours):g}: {fact(theirs):g} in the drive, whose machine is {present}: "
-                             "tables change the motor, not the board")
+        ours, theirs = fact(given), fact(carried)
+        if ours != theirs:
+            raise UsageError(f"{file}: {name} {ours:g}: {theirs:g} in the drive, whose machine is {present}: tables "
+                             "change the motor, not the board")
 
 
 def write(session: Session, tables: bytes) -> None:
-    """Programs the tables into the memory of the session's drive and ends the session of XCP. RunFailed: the drive takes
-    none, runs, or has other sources than these tools; it keeps the tables that it has."""
+    """Programs the tables into the memory of the session's drive. RunFailed: the drive takes none, runs, or has other
+    sources than these tools; it keeps the tables that it has."""
     with connected(session) as master:
         _check_sources(master)
         _require_programming(session, master)

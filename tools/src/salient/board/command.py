@@ -62,8 +62,8 @@ def _build(options: argparse.Namespace) -> int:
 def build_image(machine: str, *, clock_mhz: int = 170, controller: str = "salient", node: int = 0,
                 bit_rate: int = 1_000_000, index: bool = False, stored_tables: bool = False) -> Path:
     """The ELF image for a machine and the options of the board; of the sources only tables and port are compiled where
-    the firmware of the preset is up to date, all of them for one that takes tables over CAN. UsageError: a machine that the board cannot drive, or a bit rate that its
-    clock does not make. RunFailed: the build fails."""
+    the firmware of the preset is up to date, all of them for stored_tables. UsageError: a machine that the board cannot
+    drive, or a bit rate that its clock does not make. RunFailed: the build fails."""
     from salient.machine.file import load_machine  # NumPy and pydantic, and here only
 
     path = machine_path(machine)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from salient.bench.drive import Experiment
-from salient.bench.sampler import check_layout, _control_rate_hz, _member, variables_of
+from salient.bench.sampler import _control_rate_hz, _member, check_layout, variables_of
 from salient.bench.session import Session
 from salient.bench.xcp import connected
 from salient.errors import RunFailed

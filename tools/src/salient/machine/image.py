@@ -112,8 +112,8 @@ class Structure:
 
     @property
     def offsets(self) -> list[int]:
-        """Of each member in memory, and at the end the size there, by the rules of every processor here: a number is
-        at a multiple of its size. salient.generate.machine_layout checks them against the compiler's."""
+        """Place of each member in memory, and at the end the size there. As on every processor here a number is at a
+        multiple of its size. salient.generate.machine_layout checks them against the compiler's."""
         offsets, end = [], 0
         for member in self.members:
             offsets.append(-(-end // member.alignment) * member.alignment)
