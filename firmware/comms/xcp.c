@@ -5,11 +5,9 @@
 #include "comms/xcp_daq.h"
 #include "comms/xcp_memory.h"
 #include "comms/xcp_program.h"
-#include "control/machine_tables.h"
 #include "drive_codec.h"
 #include "fixed/fixed.h"
 #include "hal_random.h"
-#include "layout_hash.h"
 
 enum { RESPONSE = 0xFF, ERROR = 0xFE };
 enum { ID_TEXT = 0, ID_FILE_NAME = 1, ID_EPK = 5 };
@@ -61,30 +59,9 @@ static bool is_whole(const uint8_t *command, unsigned bytes) {
     return bytes >= least + (counted ? fixed_min_u32(command[1], DOWNLOAD_BYTES) : 0);
 }
 
-static char *append_hexadecimal(char *at, uint32_t value) {
-    for (int shift = 28; shift >= 0; shift -= 4) {
-        *at++ = "0123456789abcdef"[value >> shift & 0xFu];
-    }
-    return at;
-}
-
-/* "salient" and, in hexadecimal, hashes of the headers and of the machine's DBC and the size of the memory, which
- * differs with the processor. */
-static void identify(xcp_t *xcp) {
-    static const char name[] = "salient";
-    char *at = xcp->text;
-    for (unsigned i = 0; name[i] != '\0'; i++) {
-        *at++ = name[i];
-    }
-    at = append_hexadecimal(at, LAYOUT_HASH);
-    at = append_hexadecimal(at, machine_tables.dbc_hash);
-    (void)append_hexadecimal(at, xcp->words);
-}
-
 void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {
     *xcp = (xcp_t){0};
     xcp_attach(xcp, memory, words, sampler);
-    identify(xcp);
 }
 
 void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler) {

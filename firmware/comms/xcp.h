@@ -115,7 +115,6 @@ typedef struct {
     uint8_t upload_left; /* bytes of an UPLOAD still to be sent */
     uint32_t scope[XCP_SCOPE_WORDS];
     xcp_daq_t daq;
-    char text[XCP_TEXT_BYTES];
 } xcp_t;
 
 /* Objects on which a command may act. */

@@ -1,8 +1,12 @@
 #include "comms/xcp_memory.h"
 
 #include "comms/xcp_code.h"
+#include "control/machine_tables.h"
+#include "layout_hash.h"
 
 #define WORD_BYTES 4u
+#define DIGITS 8u /* of a number of the identification */
+#define BITS_OF_DIGIT 4u
 
 typedef enum { SCOPE_STOP, SCOPE_ARM, SCOPE_TRIGGER, SCOPE_COMMANDS } scope_command_t;
 
@@ -28,13 +32,30 @@ static void read_memory(const xcp_t *xcp, uint32_t offset, unsigned bytes, uint8
     }
 }
 
-static const char *text_of(const xcp_t *xcp, unsigned text) {
-    return text == 0 ? xcp->text : event_names[(text - 1u) % XCP_EVENTS];
+/* Character of the identification: "salient" and, in hexadecimal, hashes of the headers and of the machine's DBC and
+ * the size of the memory, which differs with the processor. */
+static char identification(const xcp_t *xcp, unsigned at) {
+    static const char name[] = "salient";
+    const uint32_t numbers[] = {LAYOUT_HASH, machine_tables.dbc_hash, xcp->words};
+    const unsigned first_digit = (unsigned)sizeof name - 1u;
+    if (at < first_digit) {
+        return name[at];
+    }
+    const unsigned digit = at - first_digit;
+    if (digit / DIGITS >= sizeof numbers / sizeof numbers[0]) {
+        return '\0';
+    }
+    return "0123456789abcdef"[numbers[digit / DIGITS] >> (BITS_OF_DIGIT * (DIGITS - 1u - digit % DIGITS)) & 0xFu];
+}
+
+/* at: 0..XCP_TEXT_BYTES - 1. */
+static char character(const xcp_t *xcp, unsigned text, unsigned at) {
+    return text == 0 ? identification(xcp, at) : event_names[(text - 1u) % XCP_EVENTS][at];
 }
 
 uint8_t xcp_text_length(const xcp_t *xcp, unsigned text) {
     uint8_t length = 0;
-    while (length < XCP_TEXT_BYTES && text_of(xcp, text)[length] != '\0') {
+    while (length < XCP_TEXT_BYTES && character(xcp, text, length) != '\0') {
         length++;
     }
     return length;
@@ -50,7 +71,7 @@ static uint8_t byte_at(const xcp_t *xcp, const parameters_t *parameters, uint32_
     case XCP_AREA_TABLES:
         return ((const uint8_t *)&machine_tables)[offset];
     default:
-        return (uint8_t)text_of(xcp, offset / XCP_TEXT_BYTES)[offset % XCP_TEXT_BYTES];
+        return (uint8_t)character(xcp, offset / XCP_TEXT_BYTES, offset % XCP_TEXT_BYTES);
     }
 }
 
