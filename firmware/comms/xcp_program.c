@@ -1,6 +1,8 @@
 /* [SR-61] */
 #include "comms/xcp_program.h"
 
+#include <stddef.h>
+
 #include "comms/xcp_code.h"
 
 enum { MESSAGE_BYTES = 8, ABSOLUTE = 0 };
@@ -63,7 +65,7 @@ xcp_error_t xcp_program_command(xcp_t *xcp, const hal_t *hal, const xcp_context_
 }
 
 bool xcp_program_done(xcp_t *xcp, const table_store_t *tables, xcp_error_t *error) {
-    if (!xcp->pending || table_store_busy(tables)) {
+    if (!xcp->pending || tables == NULL || table_store_busy(tables)) {
         return false;
     }
     xcp->pending = false;

@@ -22,7 +22,8 @@
 xcp_error_t xcp_program_command(xcp_t *xcp, const hal_t *hal, const xcp_context_t *context, const uint8_t *command,
                                 uint8_t *response, uint8_t *length);
 
-/* True when a command that has waited for the memory is done; error: its result. [background] */
+/* True when a command that has waited for the memory is done; error: its result. tables NULL: none has.
+ * [background] */
 bool xcp_program_done(xcp_t *xcp, const table_store_t *tables, xcp_error_t *error);
 
 #endif

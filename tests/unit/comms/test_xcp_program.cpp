@@ -204,6 +204,16 @@ TEST_F(XcpProgram, a_memory_that_fails_is_an_error) {
     EXPECT_FALSE(started());
 }
 
+TEST_F(XcpProgram, a_flipped_bit_that_says_a_command_waits_is_no_access_where_there_are_no_tables) {
+    tables = nullptr;
+    connect();
+    xcp.pending = true;
+    EXPECT_EQ(late(), bytes_t{});
+    EXPECT_EQ(send({0xFD}), failed(XCP_ERROR_BUSY));
+    EXPECT_EQ(send({0xFF, 0}).size(), 8u);
+    EXPECT_EQ(send({0xFD}).size(), 6u);
+}
+
 TEST_F(XcpProgram, silence_locks_it_again) {
     open_cleared();
     time_us += XCP_SILENT_US + 1;
