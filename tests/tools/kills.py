@@ -88,6 +88,7 @@ KINDS = {
     "scope": Kind(f"scope {_BUS} --out {{folder}}/scope", bus=True),
     "identify": Kind("identify --machine saturating --true-machine linear_cosine --bins 4 --repeats 1 "
                      "--out {folder}/identified/motor.toml"),
+    "tables": Kind(f"tables linear_cosine {_BUS}", bus=True),
     "parameters": Kind(f"parameters save {{folder}}/saved.toml {_BUS}", bus=True),
     "machine": Kind("machine saturating --out {folder}/machine"),
     "board": Kind("board build --out {folder}/board"),
@@ -212,7 +213,8 @@ def bus_of(kind: Kind, folder: Path) -> Iterator[None]:
     if not kind.bus:
         yield
         return
-    line = [sys.executable, "-m", "salient", "sim", "--pace", "realtime", "--can", f"unix:{folder}/can.sock"]
+    line = [sys.executable, "-m", "salient", "sim", "--pace", "realtime", "--can", f"unix:{folder}/can.sock",
+            "--memory", f"{folder}/memory.bin"]
     with subprocess.Popen(line, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None

@@ -18,6 +18,7 @@ typedef struct {
     drive_controller_t controller;
     uint8_t node;
     uint16_t telemetry_period_ms;
+    bool stored_tables;
 } drive_config_t;
 
 bool drive_init(drive_t *drive, hal_t *hal, const drive_config_t *config);
