@@ -95,7 +95,7 @@ def test_a_run_begins_by_no_flip_of_what_arms_the_drive(layout: Layout, state: s
 @pytest.mark.in_turns
 def test_the_judge_sees_that_a_latch_without_its_check_is_unsafe(layout: Layout, tmp_path: Path) -> None:
     bug = planted.Bug("the latch is not looked at", "firmware/drive/background_checks.c",
-                      "!self_test_latch_intact(&drive->control)", "false", ())
+                      "self_test_latch_intact(&drive->control)", "true", ())
     programs = planted.campaign_programs(bug, tmp_path)
     bit = layout.bits("control.state_machine.state").start
     classes = []
