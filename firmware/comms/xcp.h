@@ -133,11 +133,12 @@ void xcp_init(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler
  * a pointer. [background] */
 void xcp_attach(xcp_t *xcp, const void *memory, uint32_t words, sampler_t *sampler);
 
-/* Takes an XCP_COMMAND and writes its response; false when there is none, or none yet. [background] */
+/* Takes an XCP_COMMAND and writes its response; false without one, also while the command waits for the memory.
+ * [background] */
 bool xcp_receive(xcp_t *xcp, hal_t *hal, const hal_can_frame_t *frame, const xcp_context_t *context, uint32_t time_us,
                  hal_can_frame_t *response);
 
-/* Writes the response to a command that has waited for the memory; false when there is none. [background] */
+/* Writes the response to a command that has waited for the memory; false before it is done. [background] */
 bool xcp_late_response(xcp_t *xcp, const table_store_t *tables, hal_can_frame_t *response);
 
 /* Ends the session after XCP_SILENT_US, or at once in bus-off. Call it at least once in 35 minutes. [background] */

@@ -60,7 +60,7 @@ static inline unsigned nvm_ring_pages(unsigned record_words) {
 /* Finds the newest record and the place of the next one; reads only. The pages from first_page on exist. */
 void nvm_ring_init(nvm_ring_t *ring, const hal_t *hal, unsigned first_page, unsigned record_words);
 
-/* Number of the place of the valid record with a sequence number; NVM_RING_NOWHERE: there is none. */
+/* Number of the place of the valid record with a sequence number; NVM_RING_NOWHERE without one. */
 unsigned nvm_ring_place(const nvm_ring_t *ring, const hal_t *hal, uint32_t sequence);
 
 /* A payload word of the record at such a place; index within the payload. */

@@ -21,6 +21,7 @@ static_assert(sizeof(nvm_store_fault_t) == FAULT_WORDS * WORD_BYTES, "whole word
 static_assert(HAL_NVM_PAGE_WORDS / (FAULT_WORDS + NVM_RING_OVERHEAD) >= NVM_STORE_FAULTS, "in one page");
 static_assert(HAL_NVM_PAGE_WORDS / (PARAMETER_WORDS + NVM_RING_OVERHEAD) >= 2, "in one page");
 static_assert(FAULT_COUNT <= 32, "checks of an entry");
+static_assert(START_PAGE + 2 == NVM_STORE_PAGES, "two pages for each ring");
 
 /* [SR-57] [SR-58] */
 static uint64_t parameter_word(const nvm_store_t *store, const parameters_t *parameters, unsigned index) {

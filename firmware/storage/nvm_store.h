@@ -21,6 +21,9 @@
 #include "storage/nvm_ring.h"
 #include "storage/parameters.h"
 
+/* Pages of the memory from the first one on; the tables follow them (storage/table_store.h). */
+#define NVM_STORE_PAGES 6
+
 /* Faults that can be read. A page has more of them, so that they survive the erasure of the other one. */
 #define NVM_STORE_FAULTS 16
 

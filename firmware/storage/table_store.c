@@ -8,13 +8,14 @@
 #include "fixed/divide.h"
 #include "fixed/fixed.h"
 #include "layout_hash.h"
+#include "storage/nvm_store.h"
 #include "storage/parameters.h"
 
 #define WORD_BYTES sizeof(uint64_t)
 #define TABLE_WORDS ((TABLE_STORE_BYTES + WORD_BYTES - 1u) / WORD_BYTES)
 #define RECORD_WORDS (NVM_RING_OVERHEAD + 1u + TABLE_WORDS) /* with the identity */
-#define FIRST_PAGE 6u                                       /* behind the pages of nvm_store.c */
-#define FIRST_TABLE_WORD 2u                                 /* of a record, behind header and identity */
+#define FIRST_PAGE ((unsigned)NVM_STORE_PAGES)
+#define FIRST_TABLE_WORD 2u /* of a record, behind header and identity */
 
 #define HALF_REV (UINT32_C(1) << 31)
 #define ROW_WIDTH_MIN (UINT32_C(1) << 17)
@@ -87,8 +88,8 @@ static bool defaults_are_right(const machine_tables_t *tables) {
     return true;
 }
 
-/* Full scales in raw units of `of` and `built_in`, of which a parameter in the same unit has the fraction bits: equal
- * but for the rounding of the coarser one. */
+/* Two full scales, raw, with the fraction bits of a parameter in their unit: equal but for the rounding of the coarser
+ * one. */
 static bool same_range(uint32_t range, int bits, uint32_t built_in, int built_in_bits) {
     const int shift = bits - built_in_bits;
     if (shift < -RANGE_SHIFT_MAX || shift > RANGE_SHIFT_MAX) {
@@ -173,8 +174,8 @@ bool table_store_busy(const table_store_t *store) {
            (store->state == TABLE_STORE_TAKING && word_waits(store));
 }
 
-/* Writes a word of the tables: the first of those that wait. A place that the ring has passed over meanwhile has none
- * of those before it, which nobody has any more. */
+/* Writes the first of the words that wait. When the ring passes over its place the record begins anew in another one,
+ * and the words before are no longer there to be written again. */
 static void write_waiting(table_store_t *store, hal_t *hal) {
     uint64_t word;
     (void)memcpy(&word, store->waiting, sizeof word);
