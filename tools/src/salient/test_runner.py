@@ -28,6 +28,8 @@ CHECKED_FOR_SPELLING = ("docs", "firmware", "hal", "emulator", "tools", "tests",
                         ".github")
 VM_TIMEOUT_S = 1800
 CORES = len(os.sched_getaffinity(0))
+SILENT_S = 1200
+"""Duration of a Python test from which on its stack is printed: no limit, but a test that hangs is known by name."""
 
 
 @dataclass
@@ -319,7 +321,7 @@ def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequen
     if processes:
         options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
-                     f"--junitxml={report}", *options, *files, quiet=quiet)
+                     "-o", f"faulthandler_timeout={SILENT_S}", f"--junitxml={report}", *options, *files, quiet=quiet)
     count = _read_report(report)
     # Failures outside of the tests: a crash, an error at the end of the session.
     if not good and not count.failed:
