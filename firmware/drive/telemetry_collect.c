@@ -140,7 +140,7 @@ void telemetry_collect(const drive_t *drive, const hal_t *hal, uint32_t time_us,
     telemetry->status.voltage_saturated = run && torque_control_voltage_saturated(parameters, control);
     telemetry->status.mode = control->position.status.active ? DRIVE_MODE_POSITION : control->deferred.mode;
     telemetry->status.start_inhibited_by = state_machine_first_fault(control->state_machine.start_inhibit_mask);
-    telemetry->status.single_pulse = control->deferred.conduction.single_pulse;
+    telemetry->status.single_pulse = run && control->deferred.conduction.single_pulse;
     telemetry->status.cycle = drive->comms.telemetry.cycle;
 
     telemetry->motion.speed_rpm = units_milli_rpm(control->observer.speed_q22);

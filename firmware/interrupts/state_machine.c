@@ -48,6 +48,11 @@ static void end_fault(state_machine_t *state_machine) {
     record->state = 0;
 }
 
+/* One more; a drive may stand in a fault for days. */
+static uint32_t saturated_count(uint32_t ticks) {
+    return ticks + (uint32_t)(ticks < UINT32_MAX);
+}
+
 /* [SR-39] [SR-41] [SR-42] [SR-43] */
 bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, command_request_t request,
                           uint32_t initialise_ticks) {
@@ -81,7 +86,7 @@ bool state_machine_stands(state_machine_t *state_machine, uint64_t fault_mask, c
         state_machine->state = state_machine->identifies ? DRIVE_STATE_RUN : DRIVE_STATE_READY;
         break;
     case DRIVE_STATE_FAULT:
-        state_machine->fault_free_ticks = all_but_timeout == 0 ? state_machine->fault_free_ticks + 1 : 0;
+        state_machine->fault_free_ticks = all_but_timeout == 0 ? saturated_count(state_machine->fault_free_ticks) : 0;
         state_machine->clearing =
             all_but_timeout == 0 && request == COMMAND_CLEAR_FAULT && (request_changed || state_machine->clearing);
         if (state_machine->clearing &&

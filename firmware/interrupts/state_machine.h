@@ -31,7 +31,7 @@
 
 typedef struct {
     drive_state_t state;
-    uint32_t fault_free_ticks;      /* in INITIALISE and FAULT, since the last failed check */
+    uint32_t fault_free_ticks;      /* in INITIALISE and FAULT, since the last failed check; saturates */
     uint32_t start_inhibit_mask;    /* in INITIALISE: failed checks of this tick; 0 in every other state */
     bool clearing;                  /* in FAULT: requested, waits for the rest of the time */
     bool rearmed;                   /* the run request has been withdrawn since the last fault */

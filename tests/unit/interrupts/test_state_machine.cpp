@@ -343,6 +343,18 @@ TEST_F(StateMachine, ten_milliseconds_begin_after_the_fault_itself_when_it_lasts
 }
 
 // [SR-41]
+// [SR-41]
+TEST_F(StateMachine, a_fault_whose_cause_has_been_gone_for_days_is_cleared_at_once) {
+    run();
+    step(COMMAND_OFF, FAULT_BIT(FAULT_OVER_VOLTAGE));
+    state_machine.fault_free_ticks = UINT32_MAX - 1; // 30 hours at 40 kHz
+    for (int k = 0; k < 3; k++) {
+        step(COMMAND_OFF);
+        EXPECT_EQ(state_machine.fault_free_ticks, UINT32_MAX);
+    }
+    EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
+}
+
 TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_request_to_clear) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));
