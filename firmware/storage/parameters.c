@@ -227,12 +227,19 @@ void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_C
     parameters->revision++;
 }
 
-/* [SR-58] */
-bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
+bool parameters_within_limits(const int32_t values[PARAMETER_COUNT]) {
     for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
         if (!in_range(values, i)) {
             return false;
         }
+    }
+    return true;
+}
+
+/* [SR-58] */
+bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]) {
+    if (!parameters_within_limits(values)) {
+        return false;
     }
     parameters_apply(parameters, values);
     return true;

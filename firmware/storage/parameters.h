@@ -100,6 +100,9 @@ bool parameters_intact(const parameters_t *parameters);
 /* Sets every value at once. */
 void parameters_apply(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
 
+/* True when each value of a set is within its limits. */
+bool parameters_within_limits(const int32_t values[PARAMETER_COUNT]);
+
 /* As parameters_apply; false, with nothing changed, when a value is out of range. */
 bool parameters_restore(parameters_t *parameters, const int32_t values[PARAMETER_COUNT]);
 

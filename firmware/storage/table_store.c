@@ -78,16 +78,6 @@ static bool numbers_are_right(const machine_tables_t *tables) {
            tables->speed_max_q22 > 0;
 }
 
-static bool defaults_are_right(const machine_tables_t *tables) {
-    for (unsigned i = 0; i < PARAMETER_COUNT; i++) {
-        const parameter_row_t *row = parameters_row(i);
-        if (tables->parameter_default[i] < row->minimum || tables->parameter_default[i] > row->maximum) {
-            return false;
-        }
-    }
-    return true;
-}
-
 /* Two full scales, raw, with the fraction bits of a parameter in their unit: equal but for the rounding of the coarser
  * one. */
 static bool same_range(uint32_t range, int bits, uint32_t built_in, int built_in_bits) {
@@ -106,7 +96,7 @@ COLD bool table_store_usable(const machine_tables_t *tables, const machine_table
                              uint32_t control_rate_hz) {
     const int8_t *bits = tables->parameter_fraction_bits, *built_in_bits = built_in->parameter_fraction_bits;
     return numbers_are_right(tables) && rows_are_right(tables) && bins_are_right(tables) &&
-           defaults_are_right(tables) && control_rate_hz >= tables->control_rate_min_hz &&
+           parameters_within_limits(tables->parameter_default) && control_rate_hz >= tables->control_rate_min_hz &&
            same_range(tables->current_range_q9, bits[PARAMETER_CURRENT_LIMIT_A], built_in->current_range_q9,
                       built_in_bits[PARAMETER_CURRENT_LIMIT_A]) &&
            same_range(tables->voltage_range_q6, bits[PARAMETER_OVER_VOLTAGE_V], built_in->voltage_range_q6,
@@ -174,18 +164,24 @@ bool table_store_busy(const table_store_t *store) {
            (store->state == TABLE_STORE_TAKING && word_waits(store));
 }
 
-/* Writes the first of the words that wait. When the ring passes over its place the record begins anew in another one,
- * and the words before are no longer there to be written again. */
+/* The next word of the record. When the ring passes over its place the record begins anew in another one, and the words
+ * before are no longer there to be written again. */
+static nvm_ring_result_t write_word(table_store_t *store, hal_t *hal, uint64_t word) {
+    const unsigned next = store->ring.word + 1u;
+    const nvm_ring_result_t result = nvm_ring_step(&store->ring, hal, word);
+    return result == NVM_RING_WRITTEN || store->ring.word == next ? result : NVM_RING_FAILED;
+}
+
+/* Writes the first of the words that wait. */
 static void write_waiting(table_store_t *store, hal_t *hal) {
     uint64_t word;
     (void)memcpy(&word, store->waiting, sizeof word);
-    const unsigned next = store->ring.word + 1u;
-    const nvm_ring_result_t result = nvm_ring_step(&store->ring, hal, word);
+    const nvm_ring_result_t result = write_word(store, hal, word);
     store->waiting_bytes = (uint8_t)(store->waiting_bytes - WORD_BYTES);
     for (unsigned i = 0; i < TABLE_STORE_TAKE_MAX; i++) {
         store->waiting[i] = store->waiting[WORD_BYTES + i];
     }
-    if (result != NVM_RING_BUSY || store->ring.word != next) {
+    if (result != NVM_RING_BUSY) {
         store->state = TABLE_STORE_FAILED;
     }
 }
@@ -209,11 +205,10 @@ COLD void table_store_step(table_store_t *store, hal_t *hal, bool writable) {
     } else if (word_waits(store)) {
         write_waiting(store, hal);
     } else {
-        const unsigned next = store->ring.word + 1u;
-        const nvm_ring_result_t result = nvm_ring_step(&store->ring, hal, 0);
+        const nvm_ring_result_t result = write_word(store, hal, 0);
         if (result == NVM_RING_WRITTEN) {
             store->state = TABLE_STORE_WRITTEN;
-        } else if (result == NVM_RING_FAILED || store->ring.word != next) {
+        } else if (result == NVM_RING_FAILED) {
             store->state = TABLE_STORE_FAILED;
         }
     }

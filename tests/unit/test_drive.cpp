@@ -15,6 +15,7 @@
 extern "C" {
 #include "comms/e2e.h"
 #include "comms/node.h"
+#include "comms/xcp_memory.h"
 #include "drive/drive.h"
 #include "drive/telemetry_collect.h"
 #include "drive_codec.h"
@@ -1218,9 +1219,12 @@ TEST_F(Drive, telemetry_has_the_scale_of_the_tables_single_pulses_and_the_contro
     for (const double scale : {0.75, 1.0, 1.25}) {
         drive.control.table_scale.excess_q31 = int32_t((scale - 1.0) * 0x1p31);
         drive.control.deferred.conduction.single_pulse = scale > 1.0;
-        telemetry_collect(&drive, &hal, hal.time_us, &values);
-        EXPECT_EQ(values.estimates.table_scale, unsigned(scale * 0x1p15));
-        EXPECT_EQ(values.status.single_pulse, scale > 1.0);
+        for (const drive_state_t state : {DRIVE_STATE_READY, DRIVE_STATE_RUN, DRIVE_STATE_FAULT}) {
+            drive.control.state_machine.state = state;
+            telemetry_collect(&drive, &hal, hal.time_us, &values);
+            EXPECT_EQ(values.estimates.table_scale, unsigned(scale * 0x1p15));
+            EXPECT_EQ(values.status.single_pulse, state == DRIVE_STATE_RUN && scale > 1.0) << "nothing conducts";
+        }
     }
     EXPECT_EQ(values.heartbeat.controller, unsigned(DRIVE_CONTROLLER_PAPER));
 }
@@ -1757,6 +1761,82 @@ TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
 }
 
 // [SR-56]
+// Commands of XCP in their order; a response that waits for the memory comes in a later pass. [SR-61]
+class DriveWithTables : public Drive {
+  protected:
+    void SetUp() override {
+        hal.adc.bus_voltage_counts = 240 * 8;
+        const drive_config_t config = {
+            .control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER, .stored_tables = true};
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    }
+
+    // The response, and the passes of the background until it came; {} after PASSES_MAX without one.
+    std::vector<uint8_t> xcp(std::vector<uint8_t> bytes) {
+        hal_can_frame_t frame{};
+        frame.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
+        frame.length = uint8_t(bytes.size());
+        std::copy(bytes.begin(), bytes.end(), frame.data);
+        hal.from_drive.clear();
+        hal.to_drive.push_back(frame);
+        for (passes = 1; passes <= PASSES_MAX; passes++) {
+            periods(1);
+            for (const hal_can_frame_t &sent : hal.from_drive) {
+                if (sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID) {
+                    return {sent.data, sent.data + sent.length};
+                }
+            }
+        }
+        return {};
+    }
+
+    void unlock() {
+        const std::vector<uint8_t> seed = xcp({0xF8, 0, XCP_RESOURCE_PROGRAMMING});
+        ASSERT_EQ(seed.size(), 6u);
+        const std::vector<uint8_t> unlocked =
+            xcp({0xF7, 4, uint8_t(~seed[2]), uint8_t(~seed[3]), uint8_t(~seed[4]), uint8_t(~seed[5])});
+        ASSERT_EQ(unlocked.at(0), 0xFF);
+    }
+
+    static constexpr unsigned PASSES_MAX = 100;
+    static constexpr unsigned LATER = 2; // passes after the operations: the response is made, and sent
+    unsigned passes = 0;
+};
+
+TEST_F(DriveWithTables, answers_a_command_that_writes_the_memory_when_the_memory_has_it) {
+    const std::vector<uint8_t> DONE{0xFF};
+    EXPECT_EQ(xcp({0xFF, 0}).at(1), XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ | XCP_RESOURCE_PROGRAMMING);
+    ASSERT_NO_FATAL_FAILURE(unlock());
+    EXPECT_EQ(xcp({0xD2}).at(0), 0xFF);
+    EXPECT_EQ(xcp({0xF6, 0, 0, 0, uint8_t(XCP_AREA_TABLES), uint8_t(XCP_AREA_TABLES >> 8),
+                   uint8_t(XCP_AREA_TABLES >> 16), uint8_t(XCP_AREA_TABLES >> 24)}),
+              DONE);
+    EXPECT_EQ(passes, 1u);
+    const uint32_t bytes = sizeof(machine_tables_t);
+    EXPECT_EQ(xcp({0xD1, 0, 0, 0, uint8_t(bytes), uint8_t(bytes >> 8), 0, 0}), DONE);
+    EXPECT_EQ(passes, 2 + LATER) << "header and identity into an erased memory";
+    EXPECT_EQ(drive.tables.state, TABLE_STORE_TAKING);
+    EXPECT_EQ(xcp({0xD0, 6, 1, 2, 3, 4, 5, 6}), DONE);
+    EXPECT_EQ(passes, 1u) << "less than a word of the memory";
+    EXPECT_EQ(xcp({0xD0, 6, 7, 8, 9, 10, 11, 12}), DONE);
+    EXPECT_EQ(passes, 1 + LATER) << "a word";
+    EXPECT_EQ(drive.tables.taken, 12u);
+}
+
+TEST_F(Drive, without_a_memory_of_tables_programming_is_no_resource) {
+    hal_can_frame_t connect{};
+    connect.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
+    connect.length = 2;
+    connect.data[0] = 0xFF;
+    hal.to_drive.push_back(connect);
+    periods(2);
+    const auto response =
+        std::find_if(hal.from_drive.begin(), hal.from_drive.end(),
+                     [](const hal_can_frame_t &sent) { return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID; });
+    ASSERT_NE(response, hal.from_drive.end());
+    EXPECT_EQ(response->data[1], XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ);
+}
+
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     periods(100);
     const parameters_t before = drive.parameters;

@@ -353,12 +353,41 @@ TEST(UsableTables, those_of_the_program_are_and_none_with_a_value_that_leads_out
         {"unit of the current alone", [](auto &t) { t.parameter_fraction_bits[PARAMETER_CURRENT_LIMIT_A]++; }},
         {"unit of the voltage alone", [](auto &t) { t.parameter_fraction_bits[PARAMETER_OVER_VOLTAGE_V]--; }},
         {"unit far away", [](auto &t) { t.parameter_fraction_bits[PARAMETER_CURRENT_LIMIT_A] += 32; }},
+        {"unit as far below", [](auto &t) { t.parameter_fraction_bits[PARAMETER_CURRENT_LIMIT_A] -= 32; }},
     };
     for (const auto &[name, change] : changes) {
         EXPECT_FALSE(usable_after(change)) << name;
     }
     EXPECT_TRUE(usable_after([](auto &t) { t.control_rate_min_hz = RATE_HZ; }));
     EXPECT_FALSE(usable_after([](auto &t) { t.control_rate_min_hz = RATE_HZ; }, RATE_HZ - 1));
+}
+
+// Each with the reciprocals of its widths and with the bins of rows that ascend, so that nothing else is wrong.
+TEST(UsableTables, rows_that_do_not_ascend_or_have_a_width_beyond_the_limits_are_not) {
+    // Two rows share the width of the last two, in which the last bins begin.
+    const auto shared = [](uint32_t width) {
+        return usable_after([&](machine_tables_t &t) {
+            const size_t row = MACHINE_ROWS - 3;
+            t.row[row + 1].start = t.row[row].start + width;
+            for (size_t i = row; i < row + 2; i++) {
+                const uint32_t own = t.row[i + 1].start - t.row[i].start;
+                t.row[i].reciprocal = own > 0 ? int32_t((INT64_C(1) << 46) / own) : 0;
+            }
+            for (uint32_t bin = 0; bin < MACHINE_ANGLE_BINS; bin++) {
+                if (bin << MACHINE_ANGLE_BIN_BITS >= t.row[row].start) {
+                    t.angle_bin_row[bin] = uint8_t(row + (bin << MACHINE_ANGLE_BIN_BITS >= t.row[row + 1].start));
+                }
+            }
+        });
+    };
+    const uint32_t narrowest = 1u << 17, both = 0x80000000u - machine_tables.row[MACHINE_ROWS - 3].start;
+    EXPECT_TRUE(shared(both / 2));
+    EXPECT_TRUE(shared(narrowest));
+    EXPECT_TRUE(shared(both - narrowest));
+    EXPECT_FALSE(shared(narrowest - 1));
+    EXPECT_FALSE(shared(both - narrowest + 1));
+    EXPECT_FALSE(shared(0x80000000u)) << "a descent of half a revolution from the next row on";
+    EXPECT_FALSE(shared(0x80000001u)) << "wider than half a revolution";
 }
 
 TEST(UsableTables, more_than_two_rows_that_begin_within_a_bin_are_not) {
