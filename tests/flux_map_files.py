@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ REGULAR_DEG = np.linspace(0.0, HALF_DEG, 20)
 REGULAR_A = np.linspace(CURRENT_MAX_A / 20, CURRENT_MAX_A, 20)
 
 
+@cache
 def formula(name: str) -> Formula:
     """Magnetics of a bundled machine."""
     magnetics = load_machine(MACHINES / f"{name}.toml").magnetics

@@ -16,6 +16,7 @@ from salient.paths import ROOT
 EXAMPLES = ROOT / "tools" / "examples"
 
 
+@pytest.mark.in_turns
 @pytest.mark.socketcan
 @pytest.mark.parametrize("language", ["c", "py"])
 def test_the_example_runs_the_drive_and_stops_it(tmp_path, request, language):

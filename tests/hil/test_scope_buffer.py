@@ -209,6 +209,7 @@ def deviations(bench, phases, speed_rpm):
     return np.median(ratio / np.median(ratio, axis=0), axis=1) - 1
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("machine", ["finite_element", "linear_cosine", "linear_trapezoid", "saturating"])
 @pytest.mark.parametrize(("speed_rpm", "phase", "gain"), [(100, "b", 1.02), (300, "a", 0.98), (900, "c", 1.02)])
 def test_current_at_equal_flux_linkage_names_a_sensor_that_is_off(make_bench, machine, speed_rpm, phase, gain):

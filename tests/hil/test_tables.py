@@ -98,6 +98,7 @@ def test_parameters_stored_for_other_tables_are_not_used_and_the_drive_waits_for
     assert own.drive.start_inhibited_by == "parameter_memory", "nor those of the tables before"
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("operation", [1, 5, 6, 7, 300, 1229, 1230, 1231])
 def test_a_power_cut_while_they_are_written_leaves_the_tables_of_before_or_the_new_ones(own, operation: int):
     first, second = tables.tables_of(OTHER), tables.tables_of("linear_trapezoid")

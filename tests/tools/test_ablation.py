@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,17 @@ import pytest
 
 from salient.errors import UsageError
 from salient.experiments.ablation import __main__ as ablation
-from salient.experiments.ablation.cases import COUNT, PARTS, make_case
+from salient.experiments.ablation.cases import COUNT, PARTS, Case, make_case
 from salient.experiments.ablation.measure import MEASURES
 from salient.experiments.ablation.table import Ablation, cost, line, logarithms
 from salient.experiments.planted import Bug
 
 MECHANISMS = ablation.mechanisms()
-CASES = [make_case(number, 1) for number in range(COUNT)]
+
+
+@cache
+def cases() -> list[Case]:
+    return [make_case(number, 1) for number in range(COUNT)]
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda mechanism: mechanism.name)
@@ -42,7 +47,7 @@ def test_a_stale_text_names_the_table(tmp_path: Path) -> None:
 
 
 def test_a_seed_changes_what_a_case_does_not_have_on_purpose() -> None:
-    for case in CASES:
+    for case in cases():
         other = make_case(case.number, 2)
         assert other.parts == case.parts and other.scenario.speed == case.scenario.speed
         assert other.scenario.encoder_bits == case.scenario.encoder_bits
@@ -51,9 +56,9 @@ def test_a_seed_changes_what_a_case_does_not_have_on_purpose() -> None:
 
 
 def test_each_part_of_the_set_has_runs() -> None:
-    assert {part for case in CASES for part in case.parts} == set(PARTS)
-    assert len({case.scenario.machine for case in CASES}) == 20
-    assert {case.scenario.encoder_bits for case in CASES} == {9, 10, 12, 13, 14, 15, 17}
+    assert {part for case in cases() for part in case.parts} == set(PARTS)
+    assert len({case.scenario.machine for case in cases()}) == 20
+    assert {case.scenario.encoder_bits for case in cases()} == {9, 10, 12, 13, 14, 15, 17}
 
 
 def test_cost_is_the_mean_of_the_ratios_and_of_the_worst_tenth() -> None:
@@ -70,9 +75,9 @@ def test_small_values_do_not_count_and_missing_ones_are_left_out() -> None:
 
 def test_a_row_is_missed_beyond_the_scatter_of_the_seeds_and_when_runs_fail() -> None:
     values = dict.fromkeys(MEASURES, 0.1)
-    whole = [{case.number: {name: value * (1.0 + 0.01 * seed) for name, value in values.items()} for case in CASES}
+    whole = [{case.number: {name: value * (1.0 + 0.01 * seed) for name, value in values.items()} for case in cases()}
              for seed in range(3)]
-    table = Ablation(CASES, whole)
+    table = Ablation(cases(), whole)
     assert not table.row("a", ("all",), whole[0]).is_missed
     worse = whole[0] | {number: {**values, "swing": 0.3} for number in table.numbers(("moving",))}
     row = table.row("a", ("moving",), worse)

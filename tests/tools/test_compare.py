@@ -5,6 +5,7 @@ import json
 import re
 import tomllib
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,7 +38,11 @@ from salient.machine.parameter_table import read_table
 from salient.paths import MACHINES
 from salient.reference.torque_speed_bound import MOTORING, Limits, largest_torque
 
-ALL_CASES = {name: list(group.cases(False)) for name, group in GROUPS.items()}
+
+@cache
+def all_cases() -> dict[str, list[Case]]:
+    """All cases of each group, which take longer to make than most tests."""
+    return {name: list(group.cases(False)) for name, group in GROUPS.items()}
 
 
 def compare(*line):
@@ -64,14 +69,14 @@ def start_folder(tmp_path_factory):
 # --- runs -----------------------------------------------------------------------------------------------------------
 
 def test_every_target_belongs_to_a_row():
-    conditions = {(case.group, case.condition) for of in ALL_CASES.values() for case in of}
+    conditions = {(case.group, case.condition) for of in all_cases().values() for case in of}
     for group, condition, metric, statistic in TARGETS:
         assert (group, condition) in conditions
         assert (metric, statistic) in GROUPS[group].columns
 
 
 def test_every_controller_runs_in_every_group_that_it_supports():
-    for name, of in ALL_CASES.items():
+    for name, of in all_cases().items():
         salient = {key: {"salient"} for key in ("rates", "misalignment", "standing_error", "hold",
                                                 "torque_speed_random", "partial_torque", "copper", "copper_random",
                                                 "transition", "torque_conditions", "every_speed")}
@@ -82,18 +87,18 @@ def test_every_controller_runs_in_every_group_that_it_supports():
 def test_quick_runs_are_a_subset_of_the_conditions():
     for name, group in GROUPS.items():
         quick = list(group.cases(True))
-        assert 0 < len(quick) < len(ALL_CASES[name])
-        assert {case.condition for case in quick} <= {case.condition for case in ALL_CASES[name]}
+        assert 0 < len(quick) < len(all_cases()[name])
+        assert {case.condition for case in quick} <= {case.condition for case in all_cases()[name]}
 
 
 def test_load_steps_are_equally_spaced_over_one_stroke():
-    steps_s = sorted({case.scenario.load[0].at_s for case in ALL_CASES["dip"]})
+    steps_s = sorted({case.scenario.load[0].at_s for case in all_cases()["dip"]})
     assert len(steps_s) == 24
     assert np.diff(steps_s) * 6.0 * 150.0 == pytest.approx(30.0 / 24)
 
 
 def test_moving_loads_are_judged_over_two_periods_after_the_transient():
-    for case in ALL_CASES["moving"]:
+    for case in all_cases()["moving"]:
         scenario = case.scenario
         period_s = 1.0 / scenario.bench["load_sine_frequency_Hz"]
         window_s = scenario.duration_s - scenario.record.from_s
@@ -105,7 +110,7 @@ def test_moving_loads_are_judged_over_two_periods_after_the_transient():
 @pytest.mark.parametrize("group", ["torque_speed", "partial_torque", "torque_conditions"])
 def test_held_torque_is_recorded_over_whole_revolutions_of_a_shaft_that_has_its_speed(group):
     rotor_poles = {"saturating": 4, "linear_cosine": 4, "linear_trapezoid": 4, "finite_element": 6}
-    for case in ALL_CASES[group]:
+    for case in all_cases()[group]:
         scenario = case.scenario
         speed_rpm = scenario.bench["held_speed_rpm"]
         (step,) = scenario.torque
@@ -119,7 +124,7 @@ def test_held_torque_is_recorded_over_whole_revolutions_of_a_shaft_that_has_its_
 
 def test_largest_torque_is_requested_from_a_quarter_to_twice_the_base_speed_in_both_quadrants():
     for machine in ("saturating", "finite_element"):
-        of = [case for case in ALL_CASES["torque_speed"]
+        of = [case for case in all_cases()["torque_speed"]
               if case.scenario.machine == machine and case.controller == "salient"]
         speeds_rpm = sorted({case.scenario.bench["held_speed_rpm"] for case in of})
         assert speeds_rpm == [375.0, 750.0, 1125.0, 1500.0, 1875.0, 2250.0, 3000.0]
@@ -132,13 +137,13 @@ def test_parts_of_the_torque_are_those_of_the_largest_one_above_base_speed():
     limits = Limits(52.0, 300.0, 240.0)
     (largest,) = largest_torque(load_machine(machine_path("linear_cosine")), [2250.0], limits, MOTORING)
     parts = {case.condition.split(", ")[3]: case.scenario.torque[0].value_Nm / largest.torque_Nm
-             for case in ALL_CASES["partial_torque"] if "linear_cosine, 2250 r/min, motoring" in case.condition}
+             for case in all_cases()["partial_torque"] if "linear_cosine, 2250 r/min, motoring" in case.condition}
     assert parts == pytest.approx({"25 %": 0.25, "50 %": 0.5, "75 %": 0.75}, rel=0.03)
-    assert {case.scenario.bench["held_speed_rpm"] for case in ALL_CASES["partial_torque"]} == {1875.0, 2250.0, 3000.0}
+    assert {case.scenario.bench["held_speed_rpm"] for case in all_cases()["partial_torque"]} == {1875.0, 2250.0, 3000.0}
 
 
 def test_load_steps_above_base_speed_are_preceded_by_those_below():
-    for case in ALL_CASES["transition"]:
+    for case in all_cases()["transition"]:
         scenario = case.scenario
         if case.extractor != "fast_step":
             continue
@@ -151,14 +156,14 @@ def test_load_steps_above_base_speed_are_preceded_by_those_below():
 
 
 def test_ramps_have_their_lengths():
-    for case in ALL_CASES["ramps"]:
+    for case in all_cases()["ramps"]:
         ramp_s = case.scenario.load[0].torque_Nm / case.scenario.bench["load_ramp_Nm_s"]
         assert case.condition.endswith(f", {ramp_s * 1000:g} ms")
         assert case.scenario.duration_s == pytest.approx(case.scenario.load[0].at_s + ramp_s + 0.3)
 
 
 def test_compressors_are_judged_over_three_turns_after_20_turns_of_load():
-    for case in ALL_CASES["compressor"]:
+    for case in all_cases()["compressor"]:
         turn_s = 60.0 / case.scenario.speed[0].value_rpm
         (load,) = case.scenario.load
         assert case.scenario.record.from_s - load.at_s == pytest.approx(20 * turn_s, abs=1e-5)
@@ -198,20 +203,20 @@ def test_random_loads_are_of_every_kind_and_within_what_the_drive_can_make():
 
 
 def test_encoders_are_judged_over_angles_spread_over_a_stroke():
-    of = [case for case in ALL_CASES["encoders"] if case.condition == "saturating, 12 bits and edge stamps, 10 r/min"]
+    of = [case for case in all_cases()["encoders"] if case.condition == "saturating, 12 bits and edge stamps, 10 r/min"]
     assert sorted(case.scenario.initial_angle_deg for case in of) == pytest.approx(np.arange(24) * 1.25)
     assert all(case.scenario.encoder_edges and case.scenario.encoder_bits == 12 for case in of)
 
 
 def test_mean_speed_is_taken_over_whole_turns():
-    for case in ALL_CASES["standing_error"]:
+    for case in all_cases()["standing_error"]:
         scenario = case.scenario
         turns = (scenario.duration_s - scenario.record.from_s) * scenario.speed[0].value_rpm / 60.0
         assert turns == pytest.approx(max(1, round(turns)), abs=1e-4)
 
 
 def test_moving_load_of_the_misaligned_drive_is_constant_before_the_ripple_is_taken():
-    moving = [case for case in ALL_CASES["misalignment"] if case.condition.endswith("moving load")]
+    moving = [case for case in all_cases()["misalignment"] if case.condition.endswith("moving load")]
     for case in moving:
         scenario = case.scenario
         steps = scenario.load
@@ -365,7 +370,7 @@ def test_drop_above_base_speed_is_relative_to_that_below():
 @pytest.mark.in_turns
 @pytest.mark.parametrize("group", GROUPS)
 def test_written_scenario_equals_the_one_that_ran(group, tmp_path):
-    for case in ALL_CASES[group][:: max(1, len(ALL_CASES[group]) // 20)]:
+    for case in all_cases()[group][:: max(1, len(all_cases()[group]) // 20)]:
         path = tmp_path / "compare.toml"
         path.write_text(scenario_toml(case))
         assert load_scenarios(path) == [case.scenario]
@@ -435,7 +440,7 @@ def test_finished_run_counts_for_its_machine_file_only(tmp_path):
 def test_cases_of_another_machine_have_its_speeds_and_torques():
     on = subject(str(EXAMPLES / "fan12.toml"))
     scale = on.scale
-    for name, of in ALL_CASES.items():
+    for name, of in all_cases().items():
         if name in {"machines", "mismatch"} or name in speed_range.GROUPS:  # of its own
             continue
         of_paper = [case for case in of if case.scenario.machine == "saturating" and case.extractor != "counts"]
@@ -454,7 +459,7 @@ def test_cases_of_another_machine_have_its_speeds_and_torques():
 
 
 def test_speeds_are_near_and_far_from_ratios_of_counts_with_all_resolutions_and_rates():
-    cases = ALL_CASES["every_speed"]
+    cases = all_cases()["every_speed"]
     assert len(cases) == 2016 and len({case.scenario.machine for case in cases}) == 8
     assert {case.scenario.encoder_bits for case in cases} == set(range(10, 19))
     assert {case.scenario.control_rate_hz for case in cases} == {20_000, 40_000, 50_000, 100_000}
@@ -485,8 +490,8 @@ def test_the_worst_runs_are_named_and_the_spread_is_relative_to_the_median():
 
 def test_another_machine_has_its_own_runs_among_machines_of_all_sizes():
     path = EXAMPLES / "mill.toml"
-    cases = cases_of(ALL_CASES["machines"], subject(str(path)))
-    assert cases == [case for case in ALL_CASES["machines"] if case.condition.split(",")[0] == "mill"]
+    cases = cases_of(all_cases()["machines"], subject(str(path)))
+    assert cases == [case for case in all_cases()["machines"] if case.condition.split(",")[0] == "mill"]
     assert [case.controller for case in cases[:3]] == ["traditional", "paper", "salient"]
     assert {case.extractor for case in cases[3:]} == {"held"} and len(cases) == 3 + 2 * 4
 
@@ -495,7 +500,7 @@ def test_another_machine_has_its_own_runs_among_machines_of_all_sizes():
 def test_another_machine_has_its_own_speeds_and_torques_over_the_range_of_speeds(group):
     on = subject(str(EXAMPLES / "fan12.toml"))
     data = derive(on.machine)
-    cases = cases_of(ALL_CASES[group], on)
+    cases = cases_of(all_cases()[group], on)
     assert {case.condition.split(",")[0] for case in cases} == {"fan12"}
     assert {case.scenario.machine for case in cases} == {on.path}
     speeds_rpm = [case.scenario.bench.get("held_speed_rpm", 0.0) for case in cases]
@@ -510,7 +515,7 @@ def test_another_machine_has_its_own_speeds_and_torques_over_the_range_of_speeds
 def test_another_machine_is_judged_by_relative_targets_only_and_a_bundled_one_by_its_own(tmp_path):
     on = subject(str(EXAMPLES / "fan12.toml"))
     targets = targets_of(on)
-    conditions = {(case.group, case.condition) for of in ALL_CASES.values() for case in cases_of(of, on)}
+    conditions = {(case.group, case.condition) for of in all_cases().values() for case in cases_of(of, on)}
     assert targets and {key[:2] for key in targets} <= conditions
     assert {key[0] for key in targets} == {"inertia", "encoders", "misalignment", "standing_error", "mismatch"}
     limits = {key[:1] + key[2:]: target.limit for key, target in TARGETS.items()}
@@ -554,10 +559,10 @@ def test_summary_counts_runs_and_failures_of_a_commit(tmp_path):
 
 
 def test_samples_are_the_first_ones_of_each_condition():
-    kept = command._first_samples(ALL_CASES["robustness"], 3)
+    kept = command._first_samples(all_cases()["robustness"], 3)
     assert {case.sample for case in kept} == {f"drive 00{n}" for n in range(3)} | {f"load 0{n}" for n in range(3)}
     assert len(kept) == 3 * 6
-    assert command._first_samples(ALL_CASES["robustness"], None) == ALL_CASES["robustness"]
+    assert command._first_samples(all_cases()["robustness"], None) == all_cases()["robustness"]
 
 
 def test_identical_runs_are_executed_once(tmp_path):
@@ -864,4 +869,4 @@ def test_every_metric_of_a_row_has_a_label():
 
 def test_a_worker_with_another_build_ends_the_comparison():
     with pytest.raises(RunFailed, match="a worker has another build of the drive than this computer"):
-        _run((ALL_CASES["dip"][0], "digest of another build"))
+        _run((all_cases()["dip"][0], "digest of another build"))

@@ -131,6 +131,7 @@ def test_an_error_that_a_machine_cannot_have_is_left_out_and_named(tmp_path, mon
 
 # --- runs -----------------------------------------------------------------------------------------------------------
 
+@pytest.mark.in_turns
 def test_wrong_files_are_of_the_firmware_and_the_motor_is_the_right_one():
     cases = list(GROUPS["mismatch"].cases(False))
     conditions = {case.condition for case in cases}
@@ -212,6 +213,7 @@ def test_ratio_is_to_the_condition_that_a_run_is_relative_to():
     assert row.label == "K_t from 20 ms after a load step, of the right file's" and row.values == {"salient": 2.0}
 
 
+@pytest.mark.in_turns
 def test_true_machine_of_the_user_is_refused():
     with pytest.raises(UsageError, match="--true-machine linear_cosine: not with mismatch"):
         compare("mismatch", "--machine", "saturating", "--true-machine", "linear_cosine")

@@ -106,6 +106,7 @@ def covered(page):
     }).map((each) => each.id || each.textContent)""")
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize(("width", "height", "name"), [(1280, 800, "desk"), (390, 844, "phone")])
 def test_a_person_follows_the_marked_controls_with_the_keyboard(visit, make_bench, width, height, name):
     bench = make_bench()
@@ -155,6 +156,7 @@ def test_a_person_follows_the_marked_controls_with_the_keyboard(visit, make_benc
     assert line(visitor).startswith("Step 1 of 5.")
 
 
+@pytest.mark.in_turns
 def test_closed_it_stays_closed_on_the_next_server_whose_port_is_another_one(visit, make_bench, serve):
     bench = make_bench()
     visitor = visit(bench)
@@ -167,6 +169,7 @@ def test_closed_it_stays_closed_on_the_next_server_whose_port_is_another_one(vis
     assert page.is_hidden("#first-run")
 
 
+@pytest.mark.in_turns
 def test_without_any_storage_it_begins_at_each_visit_and_closes(visit, make_bench):
     visitor = visit(make_bench(), init="""
         const refuse = () => { throw new DOMException("refused", "SecurityError"); };
@@ -180,6 +183,7 @@ def test_without_any_storage_it_begins_at_each_visit_and_closes(visit, make_benc
     assert visitor.page.is_visible("#first-run")
 
 
+@pytest.mark.in_turns
 def test_of_two_drives_on_a_bus_the_page_follows_its_own(visit, make_bench):
     bench = make_bench(drives=2)
     bench.drives[1].speed_reference_rpm = 300
@@ -190,6 +194,7 @@ def test_of_two_drives_on_a_bus_the_page_follows_its_own(visit, make_bench):
     assert line(second) == "Step 4 of 5. Press Take command: one page commands a drive."
 
 
+@pytest.mark.in_turns
 def test_a_drive_in_a_fault_is_cleared_first_and_a_log_has_no_first_run(visit, make_bench, serve, browser, tmp_path):
     bench = make_bench()
     bench.drive.speed_reference_rpm = 300

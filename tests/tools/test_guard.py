@@ -63,6 +63,7 @@ def left_in(folder: Path) -> list[str]:
     return wait_until_nothing(lambda: left_of(f"{MARK}={folder}", folder / "tmp", folder))
 
 
+@pytest.mark.in_turns
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_nothing_is_left_after_a_signal(tmp_path: Path, number: signal.Signals) -> None:
     with start(BEGIN + WAKES + CHILDREN + WAIT, tmp_path) as process:

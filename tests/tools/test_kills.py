@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from kills import KINDS, kill_all, left_of, unreadable_files, wait_until_nothing
 
 from salient.cli import make_parser
@@ -17,6 +18,7 @@ def test_every_command_is_killed():
     assert set(commands) <= {kind.line.split()[0] for kind in KINDS.values() if kind.module == "salient"}
 
 
+@pytest.mark.in_turns
 def test_kills_leave_nothing_and_the_next_start_works(tmp_path: Path, capsys):
     assert kill_all(["sim", "sweep"], tmp_path, instants=1, seed=7, signals=("SIGTERM", "SIGKILL")) == 0
     assert "4 kills of 2 commands" in capsys.readouterr().out

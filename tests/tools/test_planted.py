@@ -96,6 +96,7 @@ def test_a_bug_that_is_missed_is_told_and_what_was_found_is_not_looked_for_again
     assert (note["bugs"], note["found"], note["missed"]) == (2, 1, {"over_speed: alive": ["campaign"]})
 
 
+@pytest.mark.in_turns
 def test_the_campaign_finds_a_bug_within_seconds_shrinks_and_replays_it(tmp_path: Path) -> None:
     folder = tmp_path / "found"
     found = planted.hunt_and_replay(CLEARED, folder)

@@ -240,6 +240,7 @@ def test_a_person_starts_loads_breaks_clears_tunes_and_exports(live):  # noqa: P
     assert float(exported[times[-1]]) == pytest.approx(bench.telemetry["speed_rpm"].last, abs=1e-6)
 
 
+@pytest.mark.in_turns
 def test_values_with_names_are_shown_chosen_triggered_and_exported_by_them(live):
     visitor, bench, page = live(), live.bench, None
     page = visitor.page
@@ -611,6 +612,7 @@ def test_the_page_decodes_every_signal_as_cantools_does(live):
             assert found[name] == pytest.approx(value, rel=1e-12, nan_ok=True), name
 
 
+@pytest.mark.in_turns
 def test_buffer_of_the_drive_is_armed_read_and_shown_with_cursors_and_spectrum(live):
     visitor = live()
     page, bench = visitor.page, visitor.bench

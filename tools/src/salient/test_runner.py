@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -58,8 +59,9 @@ def run(only: list[str] | None, *, thorough: bool = False) -> int:
     names = [name for name in (*STEPS, *PYTHON_TESTS, "socketcan") if not only or name in only]
     RESULTS.mkdir(parents=True, exist_ok=True)
     total = Count()
+    turn = None if thorough else turn_of_commit()
     with ThreadPoolExecutor(1) as background:
-        socketcan = background.submit(_timed, _socketcan) if "socketcan" in names else None
+        socketcan = background.submit(_timed, partial(_socketcan, turn)) if "socketcan" in names else None
         for name in names:
             if name in STEPS:
                 _print(f"--- {name}: {(STEPS[name].__doc__ or '').splitlines()[0]}")
@@ -71,7 +73,7 @@ def run(only: list[str] | None, *, thorough: bool = False) -> int:
             count, duration_s = socketcan.result()
             _print(f"--- socketcan: {count} ({duration_s:.0f} s)")
             total += count
-    total += _python_tests([name for name in names if name in PYTHON_TESTS], None if thorough else turn_of_commit())
+    total += _python_tests([name for name in names if name in PYTHON_TESTS], turn)
     _print(str(total))
     return 1 if total.failed or not total.passed else 0
 
@@ -149,13 +151,13 @@ def _python_tests(names: list[str], turn: int | None) -> Count:
     if turn is not None:
         _print(f"--- turn {turn} of 0 to {TURNS - 1}: the other tests that take long are run by `tools/salient test "
                "--thorough`")
-    count = _pytest("python", *folders, options=[] if turn is None else [f"--turn={turn}"])
+    count = _pytest("python", *folders, turn=turn)
     for folder in folders:
         _print(f"--- {folder.name}: {_read_report(RESULTS / 'python.xml', f'tests.{folder.name}.')}")
     return count
 
 
-def _socketcan() -> Count:
+def _socketcan(turn: int | None) -> Count:
     """the drive through a real SocketCAN interface, here or in a VM."""
     mark = re.compile(r"mark\.(both_transports|socketcan)\b")
     files = [path for path in sorted((TESTS / "hil").glob("test_*.py"))
@@ -163,7 +165,7 @@ def _socketcan() -> Count:
     vm = [sys.executable, "-m", "salient.vm.run", "--timeout-s", str(VM_TIMEOUT_S), "--"]
     # One after the other: there is one interface. Quiet: it runs beside other steps.
     return _pytest("socketcan", *files, options=["--salient-can=socketcan:vcan0", "-m", "both_transports or socketcan"],
-                   prefix=vm, processes=0, quiet=True)
+                   turn=turn, prefix=vm, processes=0, quiet=True)
 
 
 STEPS = {"style": _style, "unit": _unit, "sanitize": _sanitize}
@@ -312,12 +314,14 @@ def _experiments(build: str) -> Count:
     return count
 
 
-def _pytest(name: str, *files: Path, options: Sequence[str] = (), prefix: Sequence[str] = (),
+def _pytest(name: str, *files: Path, turn: int | None, options: Sequence[str] = (), prefix: Sequence[str] = (),
             processes: int = CORES, quiet: bool = False) -> Count:
-    """Runs pytest in parallel processes. The tests of a file share a process, which makes the file's fixtures once; the
-    files start in their order."""
+    """Runs pytest in parallel processes; turn: None for every turn. The tests of a file share a process, which makes
+    the file's fixtures once; the files start in their order."""
     report = RESULTS / f"{name}.xml"
     report.unlink(missing_ok=True)
+    if turn is not None:
+        options = [f"--turn={turn}", *options]
     if processes:
         options = ["-n", str(processes), "--dist", "loadfile", "--no-loadscope-reorder", *options]
     good = _succeeds(*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", ROOT,
