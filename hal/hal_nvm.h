@@ -36,7 +36,8 @@ uint64_t hal_nvm_read(const hal_t *hal, unsigned page, unsigned word);
  * error: then the content is undefined. [background] */
 bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value);
 
-/* Erases a page. False when the memory reports an error: then the content is undefined. [background] */
+/* Erases a page, and kicks the watchdog. False when the memory reports an error: then the content is undefined.
+ * [background] */
 bool hal_nvm_erase(hal_t *hal, unsigned page);
 
 #endif

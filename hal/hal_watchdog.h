@@ -5,7 +5,7 @@
 
 #include "hal.h"
 
-/* Longest time between two kicks. A port whose erasure of a page takes longer kicks in hal_nvm_erase. */
+/* Longest time between two kicks. hal_nvm_erase is one, because an erasure may take longer. */
 #define HAL_WATCHDOG_TIMEOUT_US 18000u
 
 typedef enum {

@@ -152,6 +152,7 @@ bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
 
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
     require_unmasked(hal, __func__);
+    board_watchdog_kick(hal->board);
     return nvm_erase(&hal->board->nvm, page);
 }
 
@@ -167,7 +168,7 @@ hal_reset_cause_t hal_reset_cause(const hal_t *hal) {
 
 void hal_watchdog_start(hal_t *hal) {
     require(hal, false, __func__);
-    board_watchdog_kick(hal->board);
+    board_watchdog_start(hal->board);
 }
 
 void hal_watchdog_kick(hal_t *hal) {

@@ -226,11 +226,17 @@ void board_can_rejoin(board_t *board) {
     can_bus_rejoin(board->bus, board->bus_drive, board->time_ns);
 }
 
-/* With the time in the state, so that the numbers of two runs with one seed differ once their calls do. */
-void board_watchdog_kick(board_t *board) {
+void board_watchdog_start(board_t *board) {
     board->watchdog_ns = board->time_ns + HAL_WATCHDOG_TIMEOUT_US * UINT64_C(1000);
 }
 
+void board_watchdog_kick(board_t *board) {
+    if (board->watchdog_ns != UINT64_MAX) {
+        board_watchdog_start(board);
+    }
+}
+
+/* With the time in the state, so that the numbers of two runs with one seed differ once their calls do. */
 uint32_t board_random(board_t *board) {
     board->random_state += board->time_ns;
     return (uint32_t)(random_next(&board->random_state) >> 32);

@@ -115,6 +115,8 @@ bool board_can_receive(board_t *board, hal_can_frame_t *frame);
 bool board_can_transmit(board_t *board, const hal_can_frame_t *frame);
 void board_can_status(const board_t *board, hal_can_status_t *status);
 void board_can_rejoin(board_t *board);
+void board_watchdog_start(board_t *board);
+/* Without effect before its start. */
 void board_watchdog_kick(board_t *board);
 bool board_registers_intact(const board_t *board);
 /* Second clock: whole cycles since the drive's start, and the microseconds that they are. */

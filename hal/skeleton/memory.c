@@ -21,7 +21,7 @@ bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
     return false;
 }
 
-/* FILL IN: erases a page; kicks the watchdog where that takes longer than its time. */
+/* FILL IN: erases a page; kicks the watchdog, and as often as it takes longer than its time. */
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
     (void)hal;
     (void)page;

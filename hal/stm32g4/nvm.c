@@ -60,13 +60,16 @@ static bool begin(void) {
     return true;
 }
 
-/* Ends it: waits, locks the flash, and empties the data cache, which may have the words of before. */
-static bool end(hal_t *hal) {
+/* Ends it: waits, locks the flash, and empties the data cache, which may have the words of before. kicks: an erasure
+ * takes longer than the watchdog allows; a word does not, and a background that only writes is no sign of life. */
+static bool end(hal_t *hal, bool kicks) {
     const uint32_t from_us = hal_time_us(hal);
     bool done;
     do {
         done = !(FLASH_SR & FLASH_SR_BSY);
-        hal_watchdog_kick(hal);
+        if (kicks) {
+            hal_watchdog_kick(hal);
+        }
     } while (!done && hal_time_us(hal) - from_us < OPERATION_MAX_US);
     const bool right = done && !(FLASH_SR & ERRORS);
     FLASH_CR = FLASH_CR_LOCK;
@@ -85,7 +88,7 @@ bool hal_nvm_program(hal_t *hal, unsigned page, unsigned word, uint64_t value) {
     at[0] = (uint32_t)value;
     __asm__ volatile("isb" ::: "memory"); /* two stores, not merged (RM0440, FLASH: standard programming) */
     at[1] = (uint32_t)(value >> 32);
-    return end(hal);
+    return end(hal, false);
 }
 
 bool hal_nvm_erase(hal_t *hal, unsigned page) {
@@ -94,5 +97,5 @@ bool hal_nvm_erase(hal_t *hal, unsigned page) {
     }
     FLASH_CR = FLASH_CR_PER | PUT(FLASH_CR_PNB, page) | FLASH_CR_BKER;
     FLASH_CR |= FLASH_CR_STRT;
-    return end(hal);
+    return end(hal, true);
 }

@@ -119,6 +119,7 @@ def test_image_and_host_meet_faults_and_power_cuts_alike(make_bench, tmp_path, r
     3585,  # a frame ends on the bus in the control period in which the drive goes bus-off
     5641,  # a drift is found by a second clock with steps
     7077,  # a pulse of STO within a control period
+    13272,  # a fault is logged before the background hangs: its words are no kick of the watchdog
     6412,  # a temperature sensor recovers while the temperatures are converted, after a reset
 ])
 def test_worlds_of_the_campaign_are_equal_to_the_bit(seed):

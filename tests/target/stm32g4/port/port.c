@@ -137,10 +137,13 @@ static void double_error(hal_t *hal) {
     CHECK(false);
 }
 
+/* Words of the memory are no kick. */
 static void last_kick(hal_t *hal) {
     KEPT->stage = LAST;
     hal_watchdog_kick(hal);
-    for (const uint32_t from_us = hal_time_us(hal);;) {
+    const uint32_t from_us = hal_time_us(hal);
+    for (unsigned word = 0;; word++) {
+        CHECK(word >= HAL_NVM_PAGE_WORDS || hal_nvm_program(hal, TORN_PAGE, word, word));
         KEPT->since_kick_us = hal_time_us(hal) - from_us;
         CHECK(KEPT->since_kick_us < 40000);
     }
