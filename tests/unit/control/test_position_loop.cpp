@@ -111,6 +111,17 @@ TEST_F(PositionLoop, units_are_those_of_the_speed_loop_and_the_inertia) {
     EXPECT_NEAR(double(parameters.plan.limits.acceleration), 100.0 * REV_48 * 1e-6, REV_48 * 1e-9);
 }
 
+TEST_F(PositionLoop, a_speed_beyond_the_format_is_the_fastest) {
+    position_settings_t of = settings();
+    of.speed_rpm = of.homing_speed_rpm = INT32_MAX;
+    for (const unsigned exponent : {0u, 3u}) {
+        of.speed_exponent = exponent;
+        const position_parameters_t fastest = position_configure(&of);
+        EXPECT_EQ(fastest.plan.limits.speed, parameters.plan.limits.speed) << "the largest speed reference";
+        EXPECT_GT(fastest.law.homing_speed, PROFILE_SPEED_MAX);
+    }
+}
+
 TEST_F(PositionLoop, limits_of_zero_are_found_from_torque_inertia_and_speed) {
     position_settings_t of = settings();
     of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
@@ -527,6 +538,29 @@ TEST_F(PositionLoop, targets_that_move_on_are_caught_up_with) {
     }
     EXPECT_LE(acceleration, parameters.plan.limits.acceleration + parameters.plan.limits.acceleration / 1000);
     EXPECT_LE(speed, parameters.plan.limits.speed);
+}
+
+TEST_F(PositionLoop, targets_that_become_faster_than_the_limit_are_followed_at_the_limit_and_reached_when_they_stand) {
+    for (const double sign : {1.0, -1.0}) {
+        position = {};
+        rotor_rev = speed_rev_s = 0.0;
+        position_set_point_t set_point = {};
+        set_point.order = POSITION_ORDER_CYCLIC;
+        set_point.speed_q22 = 10 << 22; // 1.59 rev/s
+        double target = 0.0, fastest = 0.0;
+        for (int k = 0; k < 400; k++) {
+            target += sign * 0.004 * (k < 150 ? std::min(1.9, 0.02 * k) : 0.0);
+            send(set_point, target);
+            for (int n = 0; n < 4; n++) {
+                ticks(1);
+                fastest = std::max(fastest, sign * double(position.profile.end.v));
+            }
+        }
+        const double limit = double(command.limits.speed);
+        EXPECT_LT(fastest, 1.01 * limit) << sign;
+        EXPECT_GT(fastest, 0.98 * limit) << sign;
+        EXPECT_NEAR(double(position.profile.end.x) / REV_48, target, 1e-6) << sign;
+    }
 }
 
 TEST_F(PositionLoop, a_following_error_is_a_controlled_stop_until_a_halt) {
