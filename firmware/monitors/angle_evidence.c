@@ -96,8 +96,8 @@ static common_t common_of(const angle_evidence_parameters_t *parameters, const f
     const int32_t suppressed_q29 = residual->shortest_q29 / 2; /* on average */
     const int32_t device_q29 = residual->device_q29;
     const int32_t pulse_q29 = fixed_max(suppressed_q29, short_q29);
-    const int64_t moving_q29 = MOVING_FACTOR * ((int64_t)parameters->flux_error_q29 + short_q29) +
-                               fixed_max(device_q29, part_q29);
+    const int64_t moving_q29 =
+        MOVING_FACTOR * ((int64_t)parameters->flux_error_q29 + short_q29) + fixed_max(device_q29, part_q29);
     const int64_t standing_q29 = parameters->flux_error_q29 + (int64_t)fixed_max(pulse_q29, device_q29);
     return (common_t){
         .parameters = parameters,

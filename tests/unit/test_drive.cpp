@@ -1649,8 +1649,8 @@ TEST_F(Drive, the_shaft_s_torque_is_learned_in_torque_mode_with_known_scale_and_
                 });
                 EXPECT_EQ(drive.table_scale.smooth_q30 > TABLE_SCALE_ONE_Q30, used && known && follows);
                 const flux_observer_parameters_t nominal = drive.control_parameters.predictive.flux;
-                const table_scale_factors_t one = table_scale_factors(
-                    TABLE_SCALE_ONE_Q30, drive.control_parameters.predictive.period_q40, &nominal);
+                const table_scale_factors_t one =
+                    table_scale_factors(TABLE_SCALE_ONE_Q30, drive.control_parameters.predictive.period_q40, &nominal);
                 const bool neutral = std::memcmp(&drive.control.table_scale, &one, sizeof one) == 0;
                 EXPECT_TRUE(neutral || follows) << "without following the tables act as they are";
                 EXPECT_FALSE(neutral && used && known && follows);
@@ -2266,8 +2266,7 @@ TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
     EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
 }
 
-// [SR-56]
-// Commands of XCP in their order; a response that waits for the memory comes in a later pass. [SR-61]
+// Commands of XCP in their order; a response that waits for the memory comes in a later pass.
 class DriveWithTables : public Drive {
   protected:
     void SetUp() override {
@@ -2309,6 +2308,7 @@ class DriveWithTables : public Drive {
     unsigned passes = 0;
 };
 
+// [SR-61]
 TEST_F(DriveWithTables, answers_a_command_that_writes_the_memory_when_the_memory_has_it) {
     const std::vector<uint8_t> DONE{0xFF};
     EXPECT_EQ(xcp({0xFF, 0}).at(1), XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ | XCP_RESOURCE_PROGRAMMING);
@@ -2336,13 +2336,14 @@ TEST_F(Drive, without_a_memory_of_tables_programming_is_no_resource) {
     connect.data[0] = 0xFF;
     hal.to_drive.push_back(connect);
     periods(2);
-    const auto response =
-        std::find_if(hal.from_drive.begin(), hal.from_drive.end(),
-                     [](const hal_can_frame_t &sent) { return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID; });
+    const auto response = std::find_if(hal.from_drive.begin(), hal.from_drive.end(), [](const hal_can_frame_t &sent) {
+        return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID;
+    });
     ASSERT_NE(response, hal.from_drive.end());
     EXPECT_EQ(response->data[1], XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     periods(100);
     const parameters_t before = drive.parameters;

@@ -264,8 +264,7 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         const int64_t step = position->past[0] - position->past[1];
         position->target = fixed_clamp_64(position->target + 2 * profile_scale(step, command->cycle.half_per_ticks),
                                           command->lowest, command->highest);
-    } else if (position->cubic_ticks == 0 && position->targets > 1 &&
-               position->profile.start.x == position->target) {
+    } else if (position->cubic_ticks == 0 && position->targets > 1 && position->profile.start.x == position->target) {
         position->cubic_ticks = 1; /* late: it goes on */
         position->profile.q = 0;
         position->profile.start.a = 0;
