@@ -125,7 +125,7 @@ COLD bool flux_residual_step(flux_residual_t *residual, const flux_sample_t *sam
     residual->delay_q29 = fixed_saturate(period_q29 + (int64_t)(period_q29 / 50) * (int32_t)sample->periods_per_ms);
     residual->shortest_q29 =
         applied_flux_shortest_pulse_q29(period_q29, machine_tables.minimum_pulse_ns, sample->periods_per_ms);
-    residual->pulse_q29 = residual->shortest_q29 > period_q29 / 64 ? residual->shortest_q29 : period_q29 / 64;
+    residual->pulse_q29 = fixed_max(residual->shortest_q29, period_q29 / 64);
     residual->device_q29 = applied_flux_device_q29(&machine_tables, sample->period_q40);
     for (unsigned phase = 0; phase < residual->phases; phase++) {
         take_phase(residual, phase, lost_at);

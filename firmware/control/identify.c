@@ -18,6 +18,8 @@
 #define HOLD_DUTY_MAX_Q15 (MODULATOR_DUTY_ONE_Q15 / 4)
 /* Its largest current, part of the limit. */
 #define HOLD_LEVEL_MAX_Q12 2048
+/* From which another square exceeds no word. */
+#define ENERGY_MAX (UINT32_MAX - (1u << 16))
 /* Rotations within a period beyond this are counted as this, 2^-16 rev. */
 #define STEP_MAX 32767
 
@@ -43,13 +45,14 @@ COLD void identify_begin(identify_t *identify, uint32_t angle, bool permitted) {
 }
 
 /* Sums of squares: (A Q7.9 >> 8)^2 / 2 is A^2 Q1, at most 2^15; 2^15 in each of the 100 periods of 1000 ms is below
- * 2^32, and the limit ends the run before a sum exceeds it. */
+ * 2^32, and the limit ends the run before a sum exceeds it. More periods in a millisecond have what fits. */
 static void check_limits(const identify_parameters_t *parameters, identify_t *identify,
                          const identify_sample_t *sample) {
     const int32_t most_q9 = parameters->limit_q9 + (parameters->limit_q9 >> 5);
     const uint32_t limit_q1 = (uint32_t)parameters->limit_q9 >> 8;
-    const uint32_t most_energy = limit_q1 * limit_q1 / 2u * parameters->periods_per_ms * IDENTIFY_ENERGY_MS;
-    for (unsigned phase = 0; phase < parameters->phases && phase < HAL_PHASES_MAX; phase++) {
+    const uint32_t most_in_ms = limit_q1 * limit_q1 / 2u * parameters->periods_per_ms; /* at most 2^25 */
+    const uint32_t most_energy = fixed_min_u32(most_in_ms, ENERGY_MAX / IDENTIFY_ENERGY_MS) * IDENTIFY_ENERGY_MS;
+    for (unsigned phase = 0; phase < parameters->phases; phase++) {
         const uint32_t current_q1 = ((uint32_t)sample->current_q9[phase] + 128u) >> 8;
         identify->energy[phase] += current_q1 * current_q1 / 2u;
         if (identify->energy[phase] > most_energy) {
@@ -74,15 +77,16 @@ static bool is_pulse(identify_kind_t kind) {
     return kind == IDENTIFY_KIND_PULSE || kind == IDENTIFY_KIND_FREEWHEEL;
 }
 
-/* The experiment of a new number, out of any other one: what carries current loses it first, or goes on being held. */
+/* The experiment of a new number, out of any other one: what carries current loses it first, or goes on being held. A
+ * phase that the machine does not have ends the present one, too: its number has changed in memory. */
 static void take_command(const identify_parameters_t *parameters, identify_t *identify) {
     const identify_command_t *command = &identify->command;
-    if (identify->state == IDENTIFY_ENDED || command->number == identify->number) {
+    const bool known = command->phase < parameters->phases;
+    if (identify->state == IDENTIFY_ENDED || (known && command->number == identify->number)) {
         return;
     }
     identify->number = command->number;
     identify->rise_q9 = identify->growth_q9 = 0;
-    const bool known = command->phase < parameters->phases && command->phase < HAL_PHASES_MAX;
     if (!known || command->kind == IDENTIFY_KIND_REST) {
         enter(identify, IDENTIFY_IDLE);
     } else if (is_pulse(command->kind)) {
@@ -136,8 +140,8 @@ static bool may_charge(const identify_t *identify, int32_t current_q9, int32_t l
     const int32_t first_q9 = identify->first_rise_q9[identify->command.phase];
     const int32_t rise_q9 = identify->rise_q9 != 0 ? identify->rise_q9 : first_q9;
     const bool on = identify->action == IDENTIFY_ON;
-    if (rise_q9 == 0) { /* the first one of all: its effect is awaited */
-        return !on && identify->periods == 0;
+    if (rise_q9 == 0) { /* the first one of all: its effect is awaited, and known after that */
+        return !on;
     }
     const int32_t now_q9 = on ? rise_q9 + identify->growth_q9 : 0;
     return current_q9 + now_q9 + rise_q9 + 2 * identify->growth_q9 <= level_q9; /* each below 2^17 */
@@ -158,7 +162,7 @@ static identify_action_t charge(const identify_parameters_t *parameters, const i
         identify->periods < IDENTIFY_CHARGE_MS * parameters->periods_per_ms) {
         return IDENTIFY_ON;
     }
-    return unknown && identify->periods < REST_PERIODS ? IDENTIFY_ZERO : IDENTIFY_OFF;
+    return unknown ? IDENTIFY_ZERO : IDENTIFY_OFF;
 }
 
 /* Its end: no current, and then a rest of some periods. */

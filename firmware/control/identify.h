@@ -56,7 +56,7 @@ typedef enum { IDENTIFY_OFF, IDENTIFY_ZERO, IDENTIFY_ON, IDENTIFY_PART } identif
 
 typedef struct {
     int32_t limit_q9;        /* current, A, Q7.9, at least 1 A */
-    uint32_t periods_per_ms; /* 20..100 */
+    uint32_t periods_per_ms; /* 20..1000; above 100 the copper loss of less than a second may be the limit */
     uint32_t phases;
 } identify_parameters_t;
 

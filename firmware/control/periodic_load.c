@@ -73,18 +73,21 @@ static void end_turn(const periodic_load_parameters_t *parameters, periodic_load
     begin_turn(load);
 }
 
+/* Q z. */
+static int32_t smooth_q8(const periodic_load_t *load, uint32_t index, int32_t smoothing_q8) {
+    const int32_t estimate_q8 = load->estimate_q8[index];
+    const int32_t curvature_q8 =
+        load->estimate_q8[(index - 1) % VALUES] - 2 * estimate_q8 + load->estimate_q8[(index + 1) % VALUES];
+    return estimate_q8 + (curvature_q8 * smoothing_q8 >> 8);
+}
+
 static int32_t updated_q8(const periodic_load_t *load, uint32_t index, int32_t smoothing_q8) {
     const int32_t profile_q8 = load->profile_q8[index];
     switch (load->mode) {
     case PERIODIC_LOAD_CLEAR:
         return 0;
-    case PERIODIC_LOAD_LEARN: {
-        const int32_t estimate_q8 = load->estimate_q8[index];
-        const int32_t curvature_q8 =
-            load->estimate_q8[(index - 1) % VALUES] - 2 * estimate_q8 + load->estimate_q8[(index + 1) % VALUES];
-        const int32_t smooth_q8 = estimate_q8 + (curvature_q8 * smoothing_q8 >> 8);
-        return profile_q8 + ((smooth_q8 - load->mean_q8 - profile_q8) >> 2);
-    }
+    case PERIODIC_LOAD_LEARN:
+        return profile_q8 + ((smooth_q8(load, index, smoothing_q8) - load->mean_q8 - profile_q8) >> 2);
     case PERIODIC_LOAD_FORGET:
         return profile_q8 >> 1;
     case PERIODIC_LOAD_KEEP:

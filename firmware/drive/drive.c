@@ -260,7 +260,9 @@ COLD static void take_command(drive_t *drive, hal_t *hal) {
         if (positions) { /* long: the interrupts of the other modes do not wait for it */
             drive->control.position_command = position;
         }
-        drive->identify.command = drive->comms.commands.identify;
+        if (drive->identify.command.number != drive->comms.commands.identify.number) { /* it stays what it began as */
+            drive->identify.command = drive->comms.commands.identify;
+        }
         if (drive->identify.command.phase + 1u == drive->control.lost_phase) { /* whose switches stay open */
             drive->identify.command.kind = IDENTIFY_KIND_REST;
         }

@@ -345,6 +345,11 @@ control_parameters_t configure_control(const parameters_t *parameters, const mac
     return control;
 }
 
+static void tune_stage(observer_bandwidth_parameters_t *bandwidth, const observer_bandwidth_parameters_t *tuned,
+                       unsigned stage) {
+    bandwidth->stage[stage] = tuned->stage[stage];
+}
+
 COLD void configure_tune(control_parameters_t *parameters, const control_parameters_t *tuned, unsigned part) {
     switch (part) {
     case CONFIGURE_TUNE_SPEED:
@@ -369,10 +374,8 @@ COLD void configure_tune(control_parameters_t *parameters, const control_paramet
     case CONFIGURE_TUNE_POSITION_PLAN:
         parameters->position.plan = tuned->position.plan;
         return;
-    default: { /* of the observer */
-        const unsigned stage = part - CONFIGURE_TUNE_FIRST_STAGE;
-        parameters->bandwidth.stage[stage] = tuned->bandwidth.stage[stage];
+    default: /* of the observer */
+        tune_stage(&parameters->bandwidth, &tuned->bandwidth, part - CONFIGURE_TUNE_FIRST_STAGE);
         return;
-    }
     }
 }

@@ -93,7 +93,7 @@ static void set_reference_point(control_parameters_t *control, const int32_t *va
         (values[PARAMETER_TURN_ON_ANGLE_DEG] + values[PARAMETER_TURN_OFF_ANGLE_DEG]) / 2);
     const int32_t flux_q29 =
         phase_map_flux_q29(tables, 0, fixed_clamp(fixed_saturate(rise_q9), 1, PHASE_MAP_CURRENT_MAX_Q9));
-    pwm_ditc_set_reference_point(&control->duty, tables, middle, flux_q29 > 0 ? flux_q29 : 1);
+    pwm_ditc_set_reference_point(&control->duty, tables, middle, fixed_max(flux_q29, 1));
 }
 
 /* Windows of the machine from its tables. */

@@ -95,11 +95,10 @@ static common_t common_of(const angle_evidence_parameters_t *parameters, const f
     const int32_t short_q29 = part_q29 * (int32_t)(parameters->rate_hz / SHORT_PERIOD_HZ);
     const int32_t suppressed_q29 = residual->shortest_q29 / 2; /* on average */
     const int32_t device_q29 = residual->device_q29;
-    const int32_t pulse_q29 = suppressed_q29 > short_q29 ? suppressed_q29 : short_q29;
-    const int64_t moving_q29 = MOVING_FACTOR * ((int64_t)parameters->flux_error_q29 + short_q29) +
-                               (device_q29 > part_q29 ? device_q29 : part_q29);
-    const int64_t standing_q29 =
-        parameters->flux_error_q29 + (int64_t)(pulse_q29 > device_q29 ? pulse_q29 : device_q29);
+    const int32_t pulse_q29 = fixed_max(suppressed_q29, short_q29);
+    const int64_t moving_q29 =
+        MOVING_FACTOR * ((int64_t)parameters->flux_error_q29 + short_q29) + fixed_max(device_q29, part_q29);
+    const int64_t standing_q29 = parameters->flux_error_q29 + (int64_t)fixed_max(pulse_q29, device_q29);
     return (common_t){
         .parameters = parameters,
         .residual = residual,
@@ -159,7 +158,7 @@ static int32_t leak(int32_t value, int32_t towards, int32_t part_q15) {
 static int32_t fastest_parting_q29(const common_t *common) {
     const int32_t turning_q29 = common->residual->sample.period_flux_q29 / 16;
     const int32_t from_rest_q29 = fixed_saturate(8 * (int64_t)common->parameters->flux_error_q29);
-    return turning_q29 > from_rest_q29 ? turning_q29 : from_rest_q29;
+    return fixed_max(turning_q29, from_rest_q29);
 }
 
 /* [SR-21] */
@@ -211,7 +210,7 @@ static bool has_moved(const common_t *common, angle_evidence_phase_t *state, con
         return false;
     }
     state->moved = change_q29 > tolerance_q29 ? state->moved + periods : 0;
-    const int32_t part_q15 = (int32_t)(((periods < leak_periods ? periods : leak_periods) << 15) / leak_periods);
+    const int32_t part_q15 = (int32_t)((fixed_min_u32(periods, leak_periods) << 15) / leak_periods);
     state->excess_q29 = leak(state->excess_q29, excess_q29, part_q15);
     state->table_q29 = leak(state->table_q29, table_q29, part_q15);
     state->drop_q29 = leak(state->drop_q29, 0, part_q15);

@@ -50,7 +50,7 @@ static flux_band_t tolerated(const flux_residual_t *residual, uint32_t distance,
 
 /* Error of the voltage in a period, Wb, Q2.29. */
 static int32_t error_q29(const flux_residual_t *residual) {
-    return residual->pulse_q29 > residual->device_q29 ? residual->pulse_q29 : residual->device_q29;
+    return fixed_max(residual->pulse_q29, residual->device_q29);
 }
 
 /* Least flux linkage by what the voltage has built up since the current was last more than a small one. */
@@ -167,11 +167,12 @@ static bool is_missing(const flux_residual_t *residual, phase_evidence_phase_t *
         state->vanished = true;
         state->vanished_at = residual->sample.periods;
     }
-    const bool vanished = state->vanished &&
-                          residual->sample.periods - state->vanished_at < VANISHED_MS * residual->sample.periods_per_ms;
+    /* Forgotten before the number of the period comes round. */
+    state->vanished = state->vanished &&
+                      residual->sample.periods - state->vanished_at < VANISHED_MS * residual->sample.periods_per_ms;
     const bool none =
         !phase->off && phase->current_q9 <= residual->offset_q9 && phase->flux_q29 > residual->delay_q29 / 2;
-    return vanished || none;
+    return state->vanished || none;
 }
 
 /* A difference on one side over TURN_MIN is one that an angle may explain: judge_doubts. [SR-25] [SR-27] */

@@ -12,10 +12,17 @@
 
 #include <gtest/gtest.h>
 
+#if defined(__x86_64__)
+#include <csignal>
+
+#include <ucontext.h>
+#endif
+
 extern "C" {
 #include "comms/e2e.h"
 #include "comms/node.h"
 #include "comms/xcp_memory.h"
+#include "drive/background_checks.h"
 #include "drive/drive.h"
 #include "drive/telemetry_collect.h"
 #include "drive_codec.h"
@@ -29,6 +36,7 @@ extern "C" {
 #include "hal_random.h"
 #include "hal_time.h"
 #include "hal_watchdog.h"
+#include "interrupts/deferred.h"
 #include "rig/nvm.h"
 }
 #include "support/equal_parameters.h"
@@ -56,7 +64,9 @@ struct hal {
     bool critical = false;
     hal_can_status_t can_status{};
     unsigned rejoins = 0;
-    std::function<void()> after_critical_section; // interrupts that were masked
+    std::function<void()> before_critical_section; // interrupts that are not masked yet
+    std::function<void()> after_critical_section;  // interrupts that were masked
+    std::function<void()> while_telemetry_is_read, while_ticks_are_read;
     unsigned deferred_requests = 0;
     hal_pwm_compare_t written{};
     hal_reset_cause_t reset_cause = HAL_RESET_POWER;
@@ -119,6 +129,9 @@ void hal_watchdog_kick(hal_t *hal) {
     hal->kicked_us = hal->time_us;
 }
 void hal_critical_enter(hal_t *hal) {
+    if (hal->before_critical_section) {
+        hal->before_critical_section();
+    }
     EXPECT_FALSE(hal->critical) << "it does not nest";
     hal->critical = true;
 }
@@ -169,7 +182,11 @@ uint32_t hal_interrupt_missed_triggers(hal_t *hal) {
     return missed;
 }
 uint32_t hal_interrupt_elapsed_ticks(const hal_t *hal) {
-    return hal->elapsed_ticks;
+    const uint32_t ticks = hal->elapsed_ticks;
+    if (hal->while_ticks_are_read) {
+        hal->while_ticks_are_read();
+    }
+    return ticks;
 }
 void hal_interrupt_request_deferred(hal_t *hal) {
     hal->deferred_requests++;
@@ -182,7 +199,10 @@ bool hal_can_receive(hal_t *hal, hal_can_frame_t *frame) {
     hal->to_drive.pop_front();
     return true;
 }
-uint32_t hal_can_receive_overflows(const hal_t *) {
+uint32_t hal_can_receive_overflows(const hal_t *hal) {
+    if (hal->while_telemetry_is_read) {
+        hal->while_telemetry_is_read();
+    }
     return 0;
 }
 bool hal_can_transmit(hal_t *hal, const hal_can_frame_t *frame) {
@@ -1087,6 +1107,86 @@ TEST_F(Drive, an_experiment_closes_no_switch_of_a_lost_phase) {
     }
 }
 
+// An experiment is one number's: whatever comes with the number of the present one changes nothing. [SR-31]
+TEST_F(Drive, an_experiment_goes_on_as_it_began_until_another_number_comes_and_closes_no_switch_of_a_lost_phase) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+    periods(100);
+    drive.degraded.lost = 2u;
+    drive.control.lost_phase = 2u;
+    const auto pulse = [this](unsigned phase, uint8_t number, uint16_t begin, uint16_t width) {
+        hal.to_drive.push_back(frames::identify_window(++counter, begin, width));
+        hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_PULSE, phase, number));
+    };
+    bool closed[3] = {};
+    const auto follow = [&](int count) {
+        std::fill(std::begin(closed), std::end(closed), false);
+        for (int k = 0; k < count; k++) {
+            periods(1);
+            for (unsigned phase = 0; phase < 3; phase++) {
+                closed[phase] |= hal.written.upper[phase] + hal.written.lower[phase] > 0;
+            }
+        }
+    };
+    pulse(2, 1, 0x8000, 16);
+    arm_for_run(100);
+    periods(2);
+    pulse(2, 2, 0x8000, 16); // a window in which the rotor is not
+    follow(40);
+    ASSERT_TRUE(drive.control.state_machine.identifies);
+    ASSERT_EQ(drive.identify.state, IDENTIFY_WAITS);
+    for (const unsigned phase : {1u, 0u, 2u}) {
+        pulse(phase, 2, 0, 0); // at once
+        follow(40);
+        EXPECT_FALSE(closed[0] || closed[1] || closed[2]) << phase;
+        EXPECT_EQ(drive.identify.state, IDENTIFY_WAITS) << phase;
+        EXPECT_EQ(drive.identify.command.phase, 2) << phase;
+        EXPECT_EQ(drive.identify.command.width_q16, 16) << phase;
+    }
+    uint8_t number = 2;
+    for (const unsigned phase : {1u, 0u, 2u}) {
+        pulse(phase, ++number, 0, 0);
+        follow(40);
+        EXPECT_EQ(closed[phase], phase != 1) << phase;
+    }
+}
+
+// A current that the voltage does not explain: tables that are not the machine's have it in experiments. [SR-31]
+TEST_F(Drive, an_experiment_loses_no_phase_by_tables_that_need_not_be_the_machine_s_and_a_run_does) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    for (const bool experiment : {true, false}) {
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        counter = 0;
+        hal.adc.phase_current_counts[0] = hal.adc.phase_current_counts[1] = hal.adc.phase_current_counts[2] = 0;
+        std::fill(std::begin(flux_Wb), std::end(flux_Wb), 0.0);
+        parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+        drive.parameters.revision++;
+        periods(100);
+        if (experiment) {
+            hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_REST, 1));
+            arm_for_run(7);
+        } else {
+            command(COMMAND_RUN, 0.0);
+        }
+        periods(20);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        ASSERT_EQ(drive.control.state_machine.identifies, experiment);
+        for (int k = 0; k < 80; k++) { // 2 ms
+            hal.time_us += 25;
+            hal.adc.phase_current_counts[1] = 500; // 10 A
+            drive_control_interrupt(&drive, &hal);
+            deferred_interrupt(&drive, &hal);
+            drive_background(&drive, &hal);
+        }
+        EXPECT_EQ(drive.control.lost_phase, experiment ? 0u : 2u);
+        EXPECT_EQ(drive.degraded.lost, experiment ? 0u : 2u);
+        if (experiment) {
+            EXPECT_TRUE(drive.control.state_machine.identifies);
+        }
+    }
+}
+
 TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
     const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
     ASSERT_TRUE(drive_init(&drive, &hal, &config)); // experiments are the controller salient's
@@ -1463,6 +1563,245 @@ TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_
 }
 
 // [SR-46]
+// [SR-24]
+TEST_F(Drive, a_rotor_held_at_its_place_is_not_pushed_in_vain_and_one_beside_it_or_under_way_is) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    const drive_t before = drive;
+    const hal_t board = hal;
+    const auto vain = [&](const position_status_t &place, const std::function<void()> &change) {
+        drive = before;
+        hal = board;
+        drive.control.position.status = place;
+        auto *results = const_cast<deferred_results_t *>(deferred_in_effect(&drive.control));
+        results->speed.speed_reference_q22 = 4 << 22;
+        results->speed.torque_max_q24 = drive.control.torque_reference_q24 = 10 << 24;
+        drive.control.observer.speed_q22 = 0;
+        drive.control.deferred_request.skipped_total += 8;
+        change();
+        background_checks(&drive, &hal, hal.time_us + 200);
+        EXPECT_EQ(drive.stall.looked_us, hal.time_us + 200) << "checked";
+        return drive.stall.vain;
+    };
+    const auto nothing = [] {};
+    const auto most = int32_t(std::max<int64_t>(4 * int64_t(drive.control_parameters.encoder_middle),
+                                                drive.control_parameters.position.law.window >> 16));
+    EXPECT_FALSE(vain({.active = true, .error = most}, nothing));
+    EXPECT_FALSE(vain({.active = true, .error = -most}, nothing));
+    EXPECT_TRUE(vain({.active = true, .error = most + 1}, nothing));
+    EXPECT_TRUE(vain({.active = true, .error = -most - 1}, nothing));
+    EXPECT_TRUE(vain({.active = false, .error = 0}, nothing)) << "speed mode";
+    EXPECT_TRUE(vain({.active = true, .error = 0, .speed_reference_q22 = 1}, nothing)) << "it moves";
+    const position_status_t away = {.active = true, .error = most + 1};
+    EXPECT_FALSE(vain(away, [&] { drive.control.position.homing = POSITION_HOMING_SEEKS; })) << "a stop is sought";
+    EXPECT_TRUE(vain(away, [&] { drive.control.position.homing = POSITION_HOMING_RETURNS; }));
+    EXPECT_FALSE(vain(away, [&] { drive.control.deferred.mode = DRIVE_MODE_TORQUE; }));
+    EXPECT_FALSE(vain(away, [&] { drive.control.state_machine.identifies = true; }));
+    EXPECT_FALSE(vain(away, [&] { drive.control.state_machine.state = DRIVE_STATE_READY; }));
+}
+
+TEST_F(Drive, the_shaft_s_torque_is_learned_in_torque_mode_with_known_scale_and_inertia_and_used_where_chosen) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    const drive_t before = drive;
+    const hal_t board = hal;
+    const auto check = [&](const std::function<void()> &change) {
+        drive = before;
+        hal = board;
+        deferred_t &deferred = drive.control.deferred;
+        deferred.mode = DRIVE_MODE_TORQUE;
+        deferred.inertia.shift = 0;
+        deferred.inertia.updates += 2u << drive.control_parameters.inertia.window_shift;
+        deferred.inertia.torque_variance_q14 = deferred.inertia.acceleration_variance_q14 =
+            deferred.inertia.covariance_q14 = 100 * drive.control_parameters.inertia.variance_min_q14;
+        drive.table_scale.intervals = TABLE_SCALE_INTERVALS_MIN;
+        drive.control.deferred_request.skipped_total += 8;
+        change();
+        background_checks(&drive, &hal, hal.time_us + 200);
+    };
+    check([] {});
+    EXPECT_GT(drive.shaft_torque.variance, 0);
+    check([&] { drive.control.deferred.mode = DRIVE_MODE_SPEED; });
+    EXPECT_EQ(drive.shaft_torque.variance, 0) << "the torque follows a load";
+    check([&] { drive.control.deferred.inertia.shift = 1; });
+    EXPECT_EQ(drive.shaft_torque.variance, 0) << "another inertia";
+    check([&] { drive.table_scale.intervals--; });
+    EXPECT_EQ(drive.shaft_torque.variance, 0) << "no scale yet";
+    for (const bool used : {false, true}) {
+        for (const bool known : {false, true}) {
+            for (const bool follows : {false, true}) {
+                check([&] {
+                    drive.shaft_torque.window = drive.control.deferred.inertia.updates >>
+                                                drive.control_parameters.inertia.window_shift; /* seen */
+                    drive.shaft_torque.variance = known ? 1 : 0;
+                    drive.shaft_torque.factor_q30 = TABLE_SCALE_ONE_Q30 + TABLE_SCALE_ONE_Q30 / 20;
+                    drive.table_scale.smooth_q30 = TABLE_SCALE_ONE_Q30;
+                    drive.table_scale.smooth_complement = ~TABLE_SCALE_ONE_Q30;
+                    drive.control_parameters.scale_by_shaft = used;
+                    drive.control_parameters.table_scale_part_q31 = follows ? 1 << 24 : 0;
+                });
+                EXPECT_EQ(drive.table_scale.smooth_q30 > TABLE_SCALE_ONE_Q30, used && known && follows);
+                const flux_observer_parameters_t nominal = drive.control_parameters.predictive.flux;
+                const table_scale_factors_t one =
+                    table_scale_factors(TABLE_SCALE_ONE_Q30, drive.control_parameters.predictive.period_q40, &nominal);
+                const bool neutral = std::memcmp(&drive.control.table_scale, &one, sizeof one) == 0;
+                EXPECT_TRUE(neutral || follows) << "without following the tables act as they are";
+                EXPECT_FALSE(neutral && used && known && follows);
+            }
+        }
+    }
+}
+
+TEST_F(Drive, a_misalignment_by_the_flux_linkage_is_solved_when_a_phase_has_enough_samples_and_before_it_is_kept) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    command(COMMAND_RUN);
+    periods(200);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    constexpr unsigned ENOUGH = 5120;
+    for (flux_angle_t &flux_angle : drive.flux_angle) {
+        flux_angle.samples = ENOUGH - 40;
+    }
+    unsigned solved = 0;
+    for (int k = 0; k < 600 && solved == 0; k++) {
+        unsigned samples[3];
+        for (unsigned phase = 0; phase < 3; phase++) {
+            samples[phase] = drive.flux_angle[phase].samples;
+            drive.control.flux_misalignment[phase] = 12345;
+        }
+        drive.control.observer.speed_q22 = 100 << 22; // as of a rotor that turns
+        hal.time_us += 25;
+        drive_control_interrupt(&drive, &hal);
+        conduct();
+        deferred_interrupt(&drive, &hal);
+        drive.control.observer.speed_q22 = 100 << 22;
+        drive_background(&drive, &hal);
+        for (unsigned phase = 0; phase < 3; phase++) {
+            const bool enough = samples[phase] == ENOUGH - 1 && drive.flux_angle[phase].samples == ENOUGH;
+            EXPECT_EQ(drive.control.flux_misalignment[phase],
+                      enough ? flux_angle_solve(&drive.flux_angle[phase]) : 12345)
+                << k << ' ' << phase;
+            solved += enough;
+        }
+    }
+    EXPECT_GT(solved, 0u);
+}
+
+#if defined(__x86_64__)
+// Interrupts after instructions of the background, by the processor's trap flag; masked ones wait.
+std::function<void()> *interrupt = nullptr;
+const bool *masked_now = nullptr;
+unsigned instructions = 0, interrupt_at = 0, interrupt_again = 0;
+
+void trap(int, siginfo_t *, void *) {
+    if (++instructions >= interrupt_at && !*masked_now) {
+        interrupt_at = interrupt_again > 0 ? instructions + interrupt_again : UINT32_MAX;
+        (*interrupt)();
+    }
+}
+
+class DriveInterrupted : public Drive {
+  protected:
+    void SetUp() override {
+        hal.adc.bus_voltage_counts = 240 * 8;
+        const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+        ASSERT_TRUE(drive_init(&drive, &hal, &config));
+        periods(100);
+        command(COMMAND_RUN);
+        periods(400);
+        ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+        periods(int(drive.flux.residual.sample.periods + 4 - counted())); // a check is due in the next background
+        counts_at = hal.encoder_counts - counted();
+        hal.time_us += 25;
+        once();
+        drive.flux.suspicious = true;
+        before = drive;
+        board = hal;
+        struct sigaction action {};
+        action.sa_sigaction = trap;
+        action.sa_flags = SA_SIGINFO;
+        sigaction(SIGTRAP, &action, &others);
+    }
+    void TearDown() override { sigaction(SIGTRAP, &others, nullptr); }
+
+    uint32_t counted() const {
+        return drive.control.deferred_request.requests + drive.control.deferred_request.skipped_total;
+    }
+    // A control period in which the encoder counts on.
+    void once() {
+        hal.encoder_counts = counts_at + counted() + 1;
+        drive_control_interrupt(&drive, &hal);
+        hal.deferred_requests = 0;
+        drive_deferred_interrupt(&drive, &hal);
+    }
+    // The background's checks, interrupted after a number of instructions and then after each further ones; how many
+    // instructions they had.
+    unsigned checks(unsigned at, unsigned again) {
+        drive = before;
+        hal = board;
+        std::function<void()> event = [this] { once(); };
+        interrupt = &event;
+        masked_now = &hal.critical;
+        instructions = 0;
+        interrupt_at = at;
+        interrupt_again = again;
+        __asm__ volatile("pushfq\n\torq $0x100, (%%rsp)\n\tpopfq" ::: "memory", "cc");
+        background_checks(&drive, &hal, hal.time_us);
+        __asm__ volatile("pushfq\n\tandq $~0x100, (%%rsp)\n\tpopfq" ::: "memory", "cc");
+        return instructions;
+    }
+
+    drive_t before{};
+    hal_t board{};
+    uint32_t counts_at = 0;
+    struct sigaction others {};
+};
+
+TEST_F(DriveInterrupted, whichever_instruction_an_interrupt_comes_after_the_checks_take_the_sample_of_one_period) {
+    const unsigned all = checks(UINT32_MAX, 0);
+    const flux_sample_t alone = drive.flux.residual.sample;
+    ASSERT_EQ(alone.periods, counted());
+    unsigned of_before = 0, of_after = 0;
+    for (unsigned at = 1; at < all; at += 1 + all / 150) {
+        checks(at, 0);
+        const flux_sample_t &sample = drive.flux.residual.sample;
+        const uint32_t later = sample.periods - alone.periods;
+        EXPECT_LE(later, 1u) << at;
+        EXPECT_EQ(sample.encoder_angle - alone.encoder_angle, later << 15) << at;
+        for (unsigned phase = 0; phase < 3; phase++) {
+            if (later == 0) {
+                EXPECT_EQ(sample.next_q29[phase], alone.next_q29[phase]) << at;
+            } else {
+                EXPECT_EQ(sample.flux_q29[phase], drive.control.applied_flux.at_sample_q29[phase]) << at;
+            }
+        }
+        of_before += later == 0;
+        of_after += later == 1;
+    }
+    EXPECT_GT(of_before, 0u);
+    EXPECT_GT(of_after, 0u);
+}
+
+TEST_F(DriveInterrupted, interrupts_that_leave_no_time_for_a_sample_let_the_check_wait_and_change_no_verdict) {
+    before.failed_checks = FAULT_BIT(FAULT_STALL);
+    checks(1, 40);
+    EXPECT_EQ(drive.flux.residual.sample.periods, before.flux.residual.sample.periods);
+    EXPECT_EQ(drive.failed_checks, FAULT_BIT(FAULT_STALL));
+    EXPECT_EQ(drive.control.reported_fault_mask & FAULT_BIT(FAULT_STALL), FAULT_BIT(FAULT_STALL));
+    background_checks(&drive, &hal, hal.time_us);
+    EXPECT_EQ(drive.flux.residual.sample.periods, counted()) << "the next one has time";
+    EXPECT_EQ(drive.failed_checks & FAULT_BIT(FAULT_STALL), 0u);
+}
+#endif
+
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -1628,6 +1967,173 @@ TEST_F(Drive, the_time_of_the_deferred_interrupt_counts_from_the_trigger_of_its_
     EXPECT_EQ(deferred.skipped_periods, 2);
 }
 
+// The next control interrupt pre-empts it between the reading of both words of the time.
+TEST_F(Drive, the_time_of_a_deferred_interrupt_that_is_pre_empted_while_it_is_read_is_that_of_the_end) {
+    periods(100);
+    drive_control_interrupt(&drive, &hal);
+    ASSERT_EQ(hal.deferred_requests, 1u);
+    hal.elapsed_ticks = 4990;
+    hal.while_ticks_are_read = [this] {
+        hal.while_ticks_are_read = nullptr;
+        hal.elapsed_ticks = 20;
+        drive_control_interrupt(&drive, &hal);
+    };
+    deferred_interrupt(&drive, &hal);
+    EXPECT_EQ(drive.deferred_used_ticks, 5000 + 20u);
+    EXPECT_EQ(drive.deferred_worst_ticks, 5000 + 20u);
+}
+
+TEST_F(Drive, telemetry_is_of_one_period_and_masks_the_interrupts_only_when_two_attempts_were_interrupted) {
+    const drive_t before = (periods(100), drive);
+    const hal_t board = hal;
+    for (const int interrupts : {0, 1, 2, 100}) {
+        drive = before;
+        hal = board;
+        hal.from_drive.clear();
+        int left = interrupts, attempts = 0, masked = 0;
+        uint32_t angle = 0;
+        hal.while_telemetry_is_read = [&] {
+            attempts++;
+            masked += hal.critical;
+            if (left > 0 && !hal.critical) {
+                left--;
+                hal.encoder_counts += 16;
+                drive_control_interrupt(&drive, &hal);
+                deferred_interrupt(&drive, &hal);
+            }
+            angle = drive.control.measurement.encoder_angle;
+        };
+        for (int k = 0; k < 400 && attempts == 0; k++) {
+            hal.time_us += 25;
+            drive_control_interrupt(&drive, &hal);
+            deferred_interrupt(&drive, &hal);
+            drive_background(&drive, &hal);
+        }
+        EXPECT_EQ(attempts, std::min(interrupts, 2) + 1) << interrupts;
+        EXPECT_EQ(masked, interrupts >= 2 ? 1 : 0) << interrupts;
+        EXPECT_EQ(angle, drive.control.measurement.encoder_angle) << interrupts;
+        EXPECT_FALSE(hal.critical);
+    }
+}
+
+// The end of a run by an interrupt before any of the background's critical sections. [SR-04]
+TEST_F(Drive, the_ramp_of_overdue_commands_commands_no_run_that_an_interrupt_has_ended_before) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.05);
+    while (hal.time_us - drive.command.time_us <= 49900) {
+        periods(1);
+    }
+    hal.time_us += 200;
+    drive_control_interrupt(&drive, &hal);
+    deferred_interrupt(&drive, &hal);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_RUN);
+    ASSERT_EQ(drive.command.mode, DRIVE_MODE_SPEED);
+    const drive_t before = drive;
+    const hal_t board = hal;
+    int ramp = -1, sections = 0; // the section in which the mode changes
+    hal.before_critical_section = [&] { sections++; };
+    hal.after_critical_section = [&] { ramp = ramp < 0 && drive.command.mode == DRIVE_MODE_TORQUE ? sections : ramp; };
+    drive_background(&drive, &hal);
+    ASSERT_GT(ramp, 0);
+    for (int at = 1; at <= ramp + 1; at++) {
+        drive = before;
+        hal = board;
+        int section = 0;
+        hal.before_critical_section = [&] {
+            if (++section == at) {
+                hal.break_causes = HAL_PWM_BREAK_STO_1;
+                drive_control_interrupt(&drive, &hal);
+            }
+        };
+        drive_background(&drive, &hal);
+        EXPECT_EQ(drive.command.mode, at <= ramp ? DRIVE_MODE_SPEED : DRIVE_MODE_TORQUE) << at;
+        EXPECT_EQ(drive.control.state_machine.state, section >= at ? DRIVE_STATE_FAULT : DRIVE_STATE_RUN) << at;
+    }
+}
+
+// [SR-60]
+TEST_F(Drive, a_fault_that_an_interrupt_clears_while_it_is_logged_is_no_entry_without_a_fault) {
+    periods(100);
+    command(COMMAND_RUN);
+    run(0.02);
+    hal.break_causes = HAL_PWM_BREAK_STO_1;
+    periods(400);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    send(COMMAND_CLEAR_FAULT);
+    drive_background(&drive, &hal);
+    ASSERT_EQ(drive.control.state_machine.state, DRIVE_STATE_FAULT);
+    drive.store.fault_seen = false; // it is about to be logged
+    const drive_t before = drive;
+    const hal_t board = hal;
+    bool cleared = true;
+    for (int at = 1; cleared; at++) {
+        drive = before;
+        hal = board;
+        int section = 0;
+        cleared = false;
+        hal.before_critical_section = [&] {
+            if (++section == at) {
+                for (int k = 0; k < 4000 && drive.control.state_machine.state == DRIVE_STATE_FAULT; k++) {
+                    drive_control_interrupt(&drive, &hal);
+                }
+                cleared = true;
+                EXPECT_EQ(drive.control.state_machine.state, DRIVE_STATE_READY);
+            }
+        };
+        drive_background(&drive, &hal);
+        for (unsigned entry = 0; entry < drive.store.waiting_count; entry++) {
+            EXPECT_NE(drive.store.waiting[entry].fault, FAULT_NONE) << at;
+        }
+        ASSERT_LT(at, 100);
+    }
+}
+
+TEST_F(Drive, the_recorder_has_each_event_s_periods_and_no_other_s) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    sampler_setup_t setup{};
+    setup.channels = 1;
+    setup.divider = 1;
+    const auto records = [&](sampler_event_t event, int count) {
+        setup.event = event;
+        EXPECT_TRUE(sampler_arm(&drive.sampler, &setup, true, &drive, DRIVE_WORDS));
+        periods(count);
+        const uint32_t written = drive.sampler.written;
+        uint32_t record[1 + SAMPLER_CHANNELS_MAX] = {}, expected_us = hal.time_us - uint32_t(written) * 25u;
+        for (uint32_t k = 0; k < written && sampler_take(&drive.sampler, record); k++) {
+            expected_us += 25;
+            EXPECT_TRUE(record[0] == expected_us || event == SAMPLER_EVENT_IDENTIFY) << event << ' ' << k;
+        }
+        sampler_stop(&drive.sampler);
+        return written;
+    };
+    EXPECT_EQ(records(SAMPLER_EVENT_CONTROL, 7), 7u);
+    EXPECT_EQ(records(SAMPLER_EVENT_BACKGROUND, 7), 7u);
+    EXPECT_EQ(records(SAMPLER_EVENT_IDENTIFY, 80), 0u) << "no experiment";
+    hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_REST, 0));
+    arm_for_run(7);
+    periods(80);
+    ASSERT_TRUE(drive.control.state_machine.identifies);
+    EXPECT_EQ(records(SAMPLER_EVENT_IDENTIFY, 200), 5u) << "one in a millisecond";
+    EXPECT_EQ(records(SAMPLER_EVENT_CONTROL, 7), 7u);
+}
+
+TEST_F(Drive, a_position_command_during_a_move_keeps_the_torque_that_the_load_left_before_it) {
+    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
+    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    periods(100);
+    for (const int32_t moves : {1, -1, 0}) {
+        drive.left_q14 = 1234;
+        drive.control.position.status.speed_reference_q22 = moves;
+        hal.to_drive.push_back(frames::position_command(++counter, COMMAND_OFF, POSITION_ORDER_PROFILE, 1 << 16));
+        drive_background(&drive, &hal);
+        EXPECT_EQ(drive.left_q14 == 1234, moves != 0) << moves;
+    }
+    EXPECT_NEAR(drive.left_q14, 15.0 / 16.0 * 16384.0, 2.0) << "all but a 16th";
+}
+
 // [SR-46]
 TEST_F(Drive, a_deferred_interrupt_that_does_not_come_opens_the_switches) {
     periods(100);
@@ -1760,8 +2266,7 @@ TEST_F(Drive, what_waits_for_the_memory_when_a_run_begins_is_stored_after_it) {
     EXPECT_EQ(drive.store.saving, NVM_STORE_SAVED);
 }
 
-// [SR-56]
-// Commands of XCP in their order; a response that waits for the memory comes in a later pass. [SR-61]
+// Commands of XCP in their order; a response that waits for the memory comes in a later pass.
 class DriveWithTables : public Drive {
   protected:
     void SetUp() override {
@@ -1803,6 +2308,7 @@ class DriveWithTables : public Drive {
     unsigned passes = 0;
 };
 
+// [SR-61]
 TEST_F(DriveWithTables, answers_a_command_that_writes_the_memory_when_the_memory_has_it) {
     const std::vector<uint8_t> DONE{0xFF};
     EXPECT_EQ(xcp({0xFF, 0}).at(1), XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ | XCP_RESOURCE_PROGRAMMING);
@@ -1830,13 +2336,14 @@ TEST_F(Drive, without_a_memory_of_tables_programming_is_no_resource) {
     connect.data[0] = 0xFF;
     hal.to_drive.push_back(connect);
     periods(2);
-    const auto response =
-        std::find_if(hal.from_drive.begin(), hal.from_drive.end(),
-                     [](const hal_can_frame_t &sent) { return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID; });
+    const auto response = std::find_if(hal.from_drive.begin(), hal.from_drive.end(), [](const hal_can_frame_t &sent) {
+        return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID;
+    });
     ASSERT_NE(response, hal.from_drive.end());
     EXPECT_EQ(response->data[1], XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ);
 }
 
+// [SR-56]
 TEST_F(Drive, a_set_acts_as_a_whole_with_its_last_frame_and_not_before) {
     periods(100);
     const parameters_t before = drive.parameters;

@@ -21,7 +21,7 @@
 
 COLD NOINLINE static int64_t saturated(int64_t value, int64_t factor) {
     int64_t product;
-    return __builtin_mul_overflow(value, factor, &product) ? PROFILE_SPEED_MAX : product;
+    return __builtin_mul_overflow(value, factor, &product) ? INT64_MAX : product; /* before it is shifted and limited */
 }
 
 /* r/min in the unit of the machine; 0 for a negative one. */

@@ -129,20 +129,17 @@ COLD static void seek(position_t *position, const position_set_point_t *set_poin
     const int64_t far = INT64_C(2) << PROFILE_FRACTION_BITS;
     position->target = position->profile.end.x + (forward ? far : -far);
     position->stops = false;
-    const bool stopped = blocked(position, sample);
-    if (set_point->homing == POSITION_HOMING_STOP_FORWARD || set_point->homing == POSITION_HOMING_STOP_BACKWARD) {
-        if (stopped) {
-            set_zero(position, position->counted, limited(set_point->target));
-            begin_here(position, sample);
-            position->target = position->profile.end.x;
-            end_homing(position, true);
-        }
-        return;
-    }
+    const bool by_stop =
+        set_point->homing == POSITION_HOMING_STOP_FORWARD || set_point->homing == POSITION_HOMING_STOP_BACKWARD;
     const int64_t turn = position->counted >> 32;
-    if (stopped) {
-        end_homing(position, false);
-    } else if (forward ? turn > position->turn : turn < position->turn) {
+    if (blocked(position, sample)) {
+        if (by_stop) {
+            set_zero(position, position->counted, limited(set_point->target));
+        }
+        begin_here(position, sample); /* ahead of the rotor, it would press on with the torque of a run */
+        position->target = position->profile.end.x;
+        end_homing(position, by_stop);
+    } else if (!by_stop && (forward ? turn > position->turn : turn < position->turn)) {
         const int64_t index = (forward ? turn : turn + 1) * POSITION_ONE_REV;
         set_zero(position, index, limited(set_point->target));
         position->homing = POSITION_HOMING_RETURNS;
@@ -267,8 +264,7 @@ COLD NOINLINE static void follow_targets(position_t *position, const position_co
         const int64_t step = position->past[0] - position->past[1];
         position->target = fixed_clamp_64(position->target + 2 * profile_scale(step, command->cycle.half_per_ticks),
                                           command->lowest, command->highest);
-    } else if (position->cubic_ticks == 0 && position->targets > 1 && !position->stops &&
-               position->profile.start.x == position->target) {
+    } else if (position->cubic_ticks == 0 && position->targets > 1 && position->profile.start.x == position->target) {
         position->cubic_ticks = 1; /* late: it goes on */
         position->profile.q = 0;
         position->profile.start.a = 0;

@@ -133,8 +133,8 @@ NOINLINE int64_t profile_stop(const profile_limits_t *limits, const profile_stat
     const uint32_t time = time_q16(state->a, limits->per_jerk);
     const int64_t ramp = speed_of_ramp(state->a, time);
     const bool forward = state->v + (state->a < 0 ? -ramp : ramp) >= 0;
-    const int64_t left = forward ? state->v + ramp : ramp - state->v;
-    const int64_t distance = stopping_distance(limits, left < 0 ? 0 : left);
+    const int64_t left = forward ? state->v + ramp : ramp - state->v; /* >= 0 on either side */
+    const int64_t distance = stopping_distance(limits, left);
     const int64_t coming = profile_by_q16(state->v, time);
     const int64_t cubic = profile_by_q16(profile_by_q16(profile_by_q16(state->a, time), time), THIRD_Q16);
     const int64_t ramped = (state->a < 0) == forward ? -coming : coming;

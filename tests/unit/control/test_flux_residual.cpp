@@ -1,4 +1,5 @@
 // Integral of the voltage against the tables: what a sample leaves in the residual. Machine: saturating, 40 kHz, 240 V.
+#include <algorithm>
 #include <cstdint>
 #include <utility>
 
@@ -73,6 +74,46 @@ TEST_F(FluxResidual, psi_by_voltage_is_unknown_from_a_lost_trigger_to_the_next_z
     step();
     conduct();
     EXPECT_TRUE(residual.phase[0].known);
+}
+
+TEST_F(FluxResidual, psi_by_voltage_is_unknown_while_an_integral_is_saturated_and_known_just_below_that) {
+    input.electrical = MIDDLE;
+    step();
+    for (const auto &[followed_q29, known] : {std::pair{INT32_MAX, false},
+                                              {-INT32_MAX, false},
+                                              {INT32_MAX - 1, true},
+                                              {-INT32_MAX + 1000, false}, // of the voltage
+                                              {-(INT32_MAX / 2), true}}) {
+        set(0, 10.0, table_Wb(10.0));
+        residual.phase[0].followed_q29 = followed_q29;
+        step();
+        EXPECT_EQ(residual.phase[0].known, known) << followed_q29;
+        EXPECT_EQ(residual.phase[0].voltage_q29,
+                  std::min<int64_t>(int64_t(input.flux_q29[0]) - followed_q29, INT32_MAX));
+    }
+    set(0, 0.0, 0.0);
+    input.off[0] = true;
+    step();
+    set(0, 10.0, table_Wb(10.0));
+    step();
+    EXPECT_TRUE(residual.phase[0].known) << "it has begun anew";
+}
+
+TEST_F(FluxResidual, a_phase_ends_by_the_voltage_alone_and_not_by_what_the_tables_have_taken_away) {
+    for (const int32_t taken_q29 : {0, 2 * PERIOD_Q29}) {
+        input.electrical = MIDDLE;
+        set(0, 10.0, table_Wb(10.0));
+        step();
+        set(0, 5.0, 0.5 * PERIOD_Q29 / Q29);
+        input.off[0] = true;
+        input.next_q29[0] = 0;
+        residual.phase[0].followed_q29 = -taken_q29;
+        const uint32_t before = residual.phase[0].zero_at;
+        step();
+        EXPECT_EQ(correction_q29[0], 0);
+        EXPECT_EQ(residual.phase[0].zero_at, taken_q29 == 0 ? input.periods : before);
+        EXPECT_EQ(residual.phase[0].followed_q29, -taken_q29);
+    }
 }
 
 TEST_F(FluxResidual, limits_of_psi_enclose_the_tables_at_every_resistance_of_a_winding) {

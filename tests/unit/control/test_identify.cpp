@@ -190,6 +190,66 @@ TEST_F(Identify, a_hold_needs_a_known_rise_and_keeps_its_level_at_most_half_of_t
         EXPECT_NEAR(current_A, level_A, 1.0);
         EXPECT_LE(peak_A, 1.25 * level_A + rise_A);
     }
+    command(IDENTIFY_KIND_HOLD, 512); // a lower one: the current falls to it at the full opposite voltage
+    const double level_A = 50.0 / 8.0;
+    for (unsigned n = 0; n < 400; n++) {
+        const double before_A = current_A;
+        step();
+        if (before_A > 1.3 * level_A + 3.0 * rise_A && n > 2) {
+            EXPECT_EQ(duty_q15[0], -ONE) << n;
+        }
+    }
+    EXPECT_NEAR(current_A, level_A, 1.0);
+}
+
+TEST_F(Identify, a_hold_ends_after_10_s_and_another_number_begins_the_next) {
+    command(IDENTIFY_KIND_PULSE, 409);
+    run_until_idle();
+    for (unsigned trial = 0; trial < 2; trial++) {
+        command(IDENTIFY_KIND_HOLD, 256);
+        run(400);
+        EXPECT_EQ(identify.state, IDENTIFY_HOLDS);
+        EXPECT_NEAR(current_A, 50.0 / 16.0, 1.0);
+        identify.periods = IDENTIFY_HOLD_MS * 40 - 10;
+        EXPECT_NEAR(run_until_idle(), 12, 1);
+        run(400);
+        expect_off();
+        EXPECT_EQ(current_A, 0.0);
+        EXPECT_EQ(identify.limit, IDENTIFY_WITHIN);
+    }
+}
+
+TEST_F(Identify, a_pulse_of_a_phase_that_carries_current_begins_when_it_has_lost_it) {
+    command(IDENTIFY_KIND_PULSE, 409);
+    run_until_idle();
+    command(IDENTIFY_KIND_HOLD, 1024);
+    run(400);
+    ASSERT_GT(current_A, 10.0);
+    command(IDENTIFY_KIND_PULSE, 2048, 100);
+    unsigned periods = 0;
+    for (; identify.state != IDENTIFY_CHARGES && periods < 100; periods++) {
+        step();
+        if (identify.state == IDENTIFY_WAITS) {
+            expect_off();
+        }
+    }
+    EXPECT_LE(current_A, 50.0 / 128.0);
+    EXPECT_NEAR(periods, 12.5 / rise_A + 3.0, 3.0);
+    EXPECT_LT(run_until_idle(), 200u);
+    EXPECT_GT(peak_A, 20.0);
+}
+
+TEST_F(Identify, a_current_that_hardly_rises_has_full_voltage_for_50_ms_and_no_longer) {
+    rise_A = 0.004;
+    command(IDENTIFY_KIND_PULSE);
+    unsigned charged = 0;
+    for (unsigned n = 0; n < 6000; n++) {
+        step();
+        charged += duty_q15[0] == ONE;
+    }
+    EXPECT_NEAR(charged, 50 * 40, 3);
+    EXPECT_EQ(identify.state, IDENTIFY_IDLE);
+    EXPECT_EQ(identify.limit, IDENTIFY_WITHIN);
 }
 
 TEST_F(Identify, a_damped_hold_has_a_quarter_while_the_rotor_approaches) {
@@ -250,6 +310,19 @@ TEST_F(Identify, the_copper_loss_of_a_second_at_the_limit_is_its_end) {
     EXPECT_NEAR(periods, 1000 * 40, 2);
 }
 
+TEST_F(Identify, at_a_rate_at_which_the_copper_loss_of_a_second_does_not_fit_it_is_as_much_as_fits) {
+    parameters.periods_per_ms = 1000;
+    parameters.limit_q9 = current_q9[1] = 66 * 512; // 8.7e9 of 4.3e9
+    unsigned periods = 0;
+    while (identify.state != IDENTIFY_ENDED && periods < 1000001) {
+        const identify_sample_t sample = {.current_q9 = current_q9, .dc_link_q6 = 240 * 64, .angle = 0};
+        identify_step(&parameters, &identify, &sample, duty_q15);
+        periods++;
+    }
+    EXPECT_EQ(identify.limit, IDENTIFY_ENERGY);
+    EXPECT_NEAR(periods, 0x1p32 / (132 * 132 / 2.0), 200.0);
+}
+
 TEST_F(Identify, travel_is_counted_over_revolutions) {
     speed = 1u << 26;
     run(640);
@@ -280,6 +353,45 @@ TEST_F(Identify, a_phase_that_the_machine_does_not_have_stays_off) {
     run(100);
     expect_off();
     EXPECT_EQ(identify.state, IDENTIFY_IDLE);
+}
+
+// A bit of its number that flips leads to no other phase's rise, nor beyond the arrays. [SR-51]
+TEST_F(Identify, a_phase_that_becomes_one_that_the_machine_does_not_have_ends_its_experiment) {
+    for (const identify_kind_t kind : {IDENTIFY_KIND_HOLD, IDENTIFY_KIND_PULSE, IDENTIFY_KIND_FREEWHEEL}) {
+        identify_begin(&identify, 0, true);
+        current_A = 0.0;
+        command(IDENTIFY_KIND_PULSE, 409);
+        run_until_idle();
+        command(kind, 2048, 20);
+        run(8);
+        ASSERT_NE(identify.state, IDENTIFY_IDLE) << kind;
+        const identify_t before = identify;
+        for (const uint8_t other : {3, HAL_PHASES_MAX, 0x80}) {
+            identify = before;
+            identify.command.phase = other;
+            step();
+            EXPECT_EQ(identify.state, IDENTIFY_IDLE) << kind << ' ' << int(other);
+            expect_off();
+            for (unsigned n = 0; n < HAL_PHASES_MAX; n++) {
+                EXPECT_EQ(identify.first_rise_q9[n], before.first_rise_q9[n]) << kind << ' ' << n;
+            }
+        }
+    }
+}
+
+TEST_F(Identify, of_a_machine_of_six_phases_each_one_has_its_experiments_and_limits) {
+    parameters.phases = HAL_PHASES_MAX;
+    for (phase = 0; phase < HAL_PHASES_MAX; phase++) {
+        std::fill(std::begin(current_q9), std::end(current_q9), 0);
+        identify_begin(&identify, 0, true);
+        current_A = peak_A = 0.0;
+        command(IDENTIFY_KIND_PULSE, 2048);
+        EXPECT_LT(run_until_idle(), 200u) << phase;
+        EXPECT_GT(peak_A, 20.0) << phase;
+        current_A = 56.0; // of which a period takes one rise away
+        step();
+        EXPECT_EQ(identify.limit, IDENTIFY_CURRENT) << phase;
+    }
 }
 
 } // namespace

@@ -87,6 +87,14 @@ TEST(Inertia, a_start_under_load_identifies_a_fifth_to_five_times_to_the_nearest
 }
 
 // One count of the angle as torque: J0 d2(angle) / window^2.
+TEST(Inertia, beyond_a_quarter_and_four_times_the_shift_is_the_last_one_whatever_is_missing_to_the_next) {
+    for (const bool fine : {false, true}) {
+        for (const auto &[gain, shift] : {std::pair{0.12, 2}, {0.15, 2}, {6.0, -2}, {7.0, -2}}) {
+            EXPECT_EQ(shift_after(settings(), gain, start, constant_8, nullptr, 1.0, fine), shift) << gain << fine;
+        }
+    }
+}
+
 TEST(Inertia, a_window_is_as_short_as_0_8_ms_and_the_24th_of_the_largest_torque_that_a_count_is_at_most_allow) {
     int by_count = 0, by_time = 0;
     for (const unsigned bits : {10u, 14u, 17u}) {

@@ -113,6 +113,19 @@ TEST(LoadObserver, gains_at_a_megahertz_are_within_0_1_percent_and_the_load_gain
 }
 
 // Under a constant load, without friction. Between samples the model predicts.
+// As of constants that have changed in memory; each factor is normalised, and 0 cannot be. [SR-51]
+TEST(LoadObserver, without_an_inertia_or_a_bandwidth_nothing_is_corrected_and_the_gains_come_back) {
+    for (const uint32_t rate_hz : {20000u, 40000u, 1000000u}) {
+        const load_observer_gains_t weightless = load_observer_gains(1000, rate_hz, 0);
+        EXPECT_EQ(weightless.load_gain_q28, 0) << rate_hz;
+        EXPECT_GT(weightless.speed_gain_q24, 0) << rate_hz;
+        const load_observer_gains_t open = load_observer_gains(0, rate_hz, 1 << 22);
+        EXPECT_EQ(open.angle_gain_q28, 0) << rate_hz;
+        EXPECT_EQ(open.speed_gain_q24, 0) << rate_hz;
+        EXPECT_EQ(open.load_gain_q28, 0) << rate_hz;
+    }
+}
+
 TEST(LoadObserver, with_deadbeat_gains_three_samples_determine_angle_speed_and_load) {
     constexpr double TORQUE_NM = 0.1, LOAD_NM = -0.2, FIRST_RAD_S = 1.5;
     const observer_parameters_t p = configure(250.0, RATE_HZ, INERTIA_KG_M2, 0.0);

@@ -625,4 +625,22 @@ TEST(MisalignmentDisturbance, is_load_torque_less_the_rounded_product_for_any_ar
     EXPECT_GT(saturating, 10000);
 }
 
+// A sum of a quarter of each; as many as there are, and no more than the state has.
+TEST(Misalignment, the_common_slope_is_of_all_phases_of_a_machine_of_three_to_six) {
+    const misalignment_parameters_t parameters{};
+    const auto mean_q24 = [&](unsigned phases) {
+        misalignment_t state{};
+        for (misalignment_phase_t &phase : state.phase) {
+            phase.slope_lag2_q24 = 1 << 24;
+        }
+        misalignment_common_step(&parameters, &state, phases, 0, 1 << 14);
+        return double(state.common_slope.mean_q24);
+    };
+    for (unsigned phases = 3; phases <= HAL_PHASES_MAX; phases++) {
+        EXPECT_NEAR(mean_q24(phases), mean_q24(3) * phases / 3.0, 4.0) << phases;
+    }
+    EXPECT_EQ(mean_q24(HAL_PHASES_MAX + 1), mean_q24(HAL_PHASES_MAX));
+    EXPECT_GT(mean_q24(3), 1000.0);
+}
+
 } // namespace

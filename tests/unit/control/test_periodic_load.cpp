@@ -439,4 +439,68 @@ TEST(PeriodicLoad, values_are_the_means_of_their_intervals_rounded_towards_zero_
     }
 }
 
+TEST(PeriodicLoad, a_turn_decides_by_its_means_at_their_limits) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    const uint32_t least = parameters.threshold_q8;
+    const auto mode = [&](uint32_t load_q8, uint32_t residual_q8, uint32_t slow_q8, uint32_t change_q8, bool moved) {
+        periodic_load_t load{};
+        load.mode = PERIODIC_LOAD_KEEP;
+        load.count = VALUES;
+        load.load_q8 = load_q8;
+        load.residual_q8 = residual_q8;
+        load.slow_q8 = slow_q8;
+        load.change_q8 = change_q8;
+        load.moved = moved;
+        const periodic_load_sample_t sample{};
+        periodic_load_step(&parameters, &load, &sample);
+        return periodic_load_mode_t(load.mode);
+    };
+    EXPECT_EQ(mode(least - 1, 0, least, 0, true), PERIODIC_LOAD_CLEAR) << "no load";
+    EXPECT_EQ(mode(least, 0, least, 0, true), PERIODIC_LOAD_KEEP);
+    EXPECT_EQ(mode(least, 4 * least + 4, least, 0, true), PERIODIC_LOAD_CLEAR) << "all of it is a residual";
+    EXPECT_EQ(mode(least, 4 * least, least, 4 * least, true), PERIODIC_LOAD_FORGET);
+    EXPECT_EQ(mode(least, least, least / 4 - 1, 0, true), PERIODIC_LOAD_CLEAR) << "the machine's ripple";
+    EXPECT_EQ(mode(least, least, least / 4, 0, true), PERIODIC_LOAD_LEARN);
+    EXPECT_EQ(mode(least, least, least, least / 2, true), PERIODIC_LOAD_KEEP) << "it does not repeat";
+    EXPECT_EQ(mode(2 * least, least - 1, least, 0, true), PERIODIC_LOAD_KEEP) << "nothing is left to learn";
+    EXPECT_EQ(mode(least, least, least, 0, false), PERIODIC_LOAD_KEEP) << "it does not move";
+}
+
+TEST(PeriodicLoad, a_mode_that_is_none_keeps_the_profile_until_the_turn_ends) { // a bit has changed in memory
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    periodic_load_t load{};
+    load.mode = 0x81;
+    load.updates = 1;
+    std::fill(std::begin(load.profile_q8), std::end(load.profile_q8), int16_t(1000));
+    periodic_load_sample_t sample{};
+    sample.angle = (1u << 26) + 1000;
+    periodic_load_step(&parameters, &load, &sample);
+    EXPECT_EQ(load.count, 1u);
+    for (const int16_t value : load.profile_q8) {
+        EXPECT_EQ(value, 1000);
+    }
+    load.count = VALUES;
+    periodic_load_step(&parameters, &load, &sample);
+    EXPECT_EQ(load.mode, PERIODIC_LOAD_CLEAR);
+}
+
+TEST(PeriodicLoad, a_value_that_lasts_longer_than_its_count_is_the_mean_of_what_was_counted) {
+    const periodic_load_parameters_t parameters =
+        periodic_load_configure(RATE_HZ, BANDWIDTH_RAD_S, to_fixed(TORQUE_MAX_NM, Q24), ROTOR_POLES);
+    for (const double load_Nm : {-63.0, 63.0}) {
+        periodic_load_t load{};
+        periodic_load_sample_t sample{};
+        sample.load_torque_q24 = to_fixed(load_Nm, Q24);
+        for (int k = 0; k < 70000; k++) { // at standstill
+            periodic_load_step(&parameters, &load, &sample);
+        }
+        EXPECT_EQ(load.updates, UINT16_MAX);
+        sample.angle = 1u << 26;
+        periodic_load_step(&parameters, &load, &sample);
+        EXPECT_EQ(load.estimate_q8[0], int(load_Nm * 256.0));
+    }
+}
+
 } // namespace

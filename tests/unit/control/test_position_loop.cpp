@@ -111,6 +111,17 @@ TEST_F(PositionLoop, units_are_those_of_the_speed_loop_and_the_inertia) {
     EXPECT_NEAR(double(parameters.plan.limits.acceleration), 100.0 * REV_48 * 1e-6, REV_48 * 1e-9);
 }
 
+TEST_F(PositionLoop, a_speed_beyond_the_format_is_the_fastest) {
+    position_settings_t of = settings();
+    of.speed_rpm = of.homing_speed_rpm = INT32_MAX;
+    for (const unsigned exponent : {0u, 3u}) {
+        of.speed_exponent = exponent;
+        const position_parameters_t fastest = position_configure(&of);
+        EXPECT_EQ(fastest.plan.limits.speed, parameters.plan.limits.speed) << "the largest speed reference";
+        EXPECT_GT(fastest.law.homing_speed, PROFILE_SPEED_MAX);
+    }
+}
+
 TEST_F(PositionLoop, limits_of_zero_are_found_from_torque_inertia_and_speed) {
     position_settings_t of = settings();
     of.acceleration_rpm_s = of.jerk_rpm_s2 = 0;
@@ -268,6 +279,43 @@ TEST_F(PositionLoop, other_end_stops_move_no_rotor_that_rests_and_shorten_a_move
     command.highest = int64_t(9.0 * REV_48);
     ticks(3000);
     EXPECT_NEAR(rotor_rev, 9.0, 1e-6) << "a new set point";
+}
+
+TEST_F(PositionLoop, an_end_stop_that_comes_nearer_shortens_a_move_in_either_direction) {
+    for (const double sign : {1.0, -1.0}) {
+        position = {};
+        rotor_rev = 0.0;
+        order(POSITION_ORDER_PROFILE, sign * 10.0);
+        ticks(100);
+        EXPECT_FALSE(position.status.limited);
+        (sign > 0.0 ? command.highest : command.lowest) = int64_t(sign * 8.0 * REV_48);
+        ticks(1);
+        EXPECT_TRUE(position.status.limited) << sign;
+        ticks(3000);
+        EXPECT_NEAR(rotor_rev, sign * 8.0, 1e-6);
+    }
+}
+
+TEST_F(PositionLoop, skipped_periods_of_more_than_a_tick_let_the_reference_wait_and_leave_no_rest) {
+    order(POSITION_ORDER_PROFILE, 5.0);
+    ticks(200);
+    const auto skips = [this](uint32_t periods) {
+        const int64_t before = position.profile.start.x;
+        position_sample_t now = sample();
+        now.periods = periods;
+        out = position_step(&parameters.law, &position, &command, &now);
+        return double(position.profile.start.x - before) / REV_48;
+    };
+    ASSERT_EQ(position.phase, 0u);
+    const double tick_rev = speed_rev_s * 1e-3;
+    EXPECT_NEAR(skips(2 * PERIODS - 1), tick_rev, 0.1 * tick_rev);
+    EXPECT_EQ(position.phase, unsigned(PERIODS - 1));
+    EXPECT_NEAR(skips(1 + PERIODS), tick_rev, 0.1 * tick_rev) << "one tick, though two have passed";
+    EXPECT_EQ(position.phase, 0u);
+    EXPECT_NEAR(skips(10 * PERIODS + 3), tick_rev, 0.1 * tick_rev);
+    EXPECT_EQ(position.phase, 0u);
+    ticks(2000);
+    EXPECT_NEAR(rotor_rev, 5.0, 1e-6);
 }
 
 TEST_F(PositionLoop, the_period_of_a_set_point_replaces_the_parameters) {
@@ -492,6 +540,29 @@ TEST_F(PositionLoop, targets_that_move_on_are_caught_up_with) {
     EXPECT_LE(speed, parameters.plan.limits.speed);
 }
 
+TEST_F(PositionLoop, targets_that_become_faster_than_the_limit_are_followed_at_the_limit_and_reached_when_they_stand) {
+    for (const double sign : {1.0, -1.0}) {
+        position = {};
+        rotor_rev = speed_rev_s = 0.0;
+        position_set_point_t set_point = {};
+        set_point.order = POSITION_ORDER_CYCLIC;
+        set_point.speed_q22 = 10 << 22; // 1.59 rev/s
+        double target = 0.0, fastest = 0.0;
+        for (int k = 0; k < 400; k++) {
+            target += sign * 0.004 * (k < 150 ? std::min(1.9, 0.02 * k) : 0.0);
+            send(set_point, target);
+            for (int n = 0; n < 4; n++) {
+                ticks(1);
+                fastest = std::max(fastest, sign * double(position.profile.end.v));
+            }
+        }
+        const double limit = double(command.limits.speed);
+        EXPECT_LT(fastest, 1.01 * limit) << sign;
+        EXPECT_GT(fastest, 0.98 * limit) << sign;
+        EXPECT_NEAR(double(position.profile.end.x) / REV_48, target, 1e-6) << sign;
+    }
+}
+
 TEST_F(PositionLoop, a_following_error_is_a_controlled_stop_until_a_halt) {
     highest_rev = 2.0;
     order(POSITION_ORDER_PROFILE, 5.0);
@@ -565,6 +636,68 @@ TEST_F(PositionLoop, homing_by_a_stop_finds_it_and_holds_there) {
     order(POSITION_ORDER_PROFILE, 1.5);
     ticks(1000);
     EXPECT_NEAR(rotor_rev, -0.4, 1e-4);
+}
+
+TEST_F(PositionLoop, a_homing_by_the_index_that_meets_a_stop_has_failed_and_does_not_press_against_it) {
+    for (const position_homing_t method : {POSITION_HOMING_INDEX_FORWARD, POSITION_HOMING_INDEX_BACKWARD}) {
+        position = {};
+        parameters.law.following_error = int64_t(REV_48);
+        speed_rev_s = 0.0;
+        rotor_rev = 0.5;
+        highest_rev = 0.7;
+        lowest_rev = 0.3;
+        order(POSITION_ORDER_HOME, 3.0, method);
+        ticks(20);
+        EXPECT_TRUE(position.status.homing && position_seeks_stop(&position));
+        ticks(500);
+        EXPECT_TRUE(position.status.homing_failed) << method;
+        EXPECT_FALSE(position.status.homed || position.status.homing || position.status.following_error) << method;
+        EXPECT_NEAR(rotor_rev, method == POSITION_HOMING_INDEX_FORWARD ? 0.7 : 0.3, 1e-5);
+        EXPECT_NEAR(double(position.status.error) / REV_32, 0.0, 1e-4) << method;
+        EXPECT_NEAR(out.speed_q22 / 4194304.0, 0.0, 0.1) << method;
+        EXPECT_NEAR(position_rev(), rotor_rev, 1e-5) << "the zero is the old one";
+    }
+}
+
+TEST_F(PositionLoop, a_homing_that_has_failed_is_not_found_by_a_following_error) {
+    order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_STOP_FORWARD);
+    ticks(50);
+    order(POSITION_ORDER_HALT, 0.0);
+    ticks(300);
+    ASSERT_TRUE(position.status.homing_failed);
+    rotor_rev += 0.3;
+    ticks(3);
+    EXPECT_TRUE(position.status.following_error);
+    EXPECT_TRUE(position.status.homing_failed);
+    // One that returns ends with it; one that has been found stays found.
+    for (const bool returns : {true, false}) {
+        position = {};
+        rotor_rev = 0.25;
+        speed_rev_s = 0.0;
+        order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_INDEX_FORWARD);
+        for (int k = 0; k < 1000 && position.homing != POSITION_HOMING_RETURNS; k++) {
+            ticks(1);
+        }
+        ASSERT_EQ(position.homing, POSITION_HOMING_RETURNS);
+        ticks(returns ? 0 : 1000);
+        EXPECT_EQ(position.status.homing, returns);
+        rotor_rev += 0.3;
+        ticks(3);
+        EXPECT_TRUE(position.status.following_error);
+        EXPECT_EQ(position.status.homing_failed, returns);
+        EXPECT_FALSE(position.status.homing);
+    }
+}
+
+// A bit of the step that flips leads to a stop by the profile, not beyond the target. [SR-51]
+TEST_F(PositionLoop, a_step_of_a_homing_that_is_none_stops) {
+    order(POSITION_ORDER_HOME, 0.0, POSITION_HOMING_STOP_FORWARD);
+    ticks(100);
+    ASSERT_GT(speed_rev_s, 1.0);
+    position.homing = static_cast<position_homing_step_t>(POSITION_HOMING_RETURNS + 2);
+    ticks(500);
+    EXPECT_NEAR(speed_rev_s, 0.0, 1e-3);
+    EXPECT_TRUE(position.stops);
 }
 
 TEST_F(PositionLoop, a_homing_by_a_stop_counts_its_50_ms_anew_after_one_that_was_given_up) {

@@ -167,6 +167,51 @@ TEST(PositionProfile, lower_limits_in_a_move_are_reached_by_the_jerk_and_the_end
     EXPECT_TRUE(profile_arrived(&profile, target));
 }
 
+// The last three ticks have jerks of their own; a state that is too fast for them passes the target first.
+TEST(PositionProfile, from_any_speed_and_acceleration_at_the_target_it_ends_there_exactly_within_its_limits) {
+    const int64_t most = INT64_C(1) << 49, near = INT64_C(1) << 46;
+    const profile_limits_t limits = profile_limits(most, most, most, most);
+    const int64_t target = INT64_C(1) << 50;
+    for (const int64_t v : {INT64_C(0), 2 * near, -2 * near}) {
+        for (const int64_t a : {INT64_C(0), 2 * near, -2 * near}) {
+            profile_t profile;
+            profile_begin_moving(&profile, target - v, v);
+            profile.end.a = a;
+            int ticks = 0;
+            for (; (ticks == 0 || !profile_arrived(&profile, target)) && ticks < 300; ticks++) {
+                const int64_t before = profile.end.a;
+                tick(limits, &profile, target);
+                ASSERT_LE(std::abs(profile.end.a - before), 6 * limits.q) << v << ' ' << a;
+                ASSERT_LE(std::abs(profile.end.v), limits.speed) << v << ' ' << a;
+            }
+            EXPECT_TRUE(profile_arrived(&profile, target)) << v << ' ' << a;
+            EXPECT_EQ(ticks > 3, v != 0 || a != 0) << v << ' ' << a;
+        }
+    }
+}
+
+TEST(PositionProfile, so_near_that_each_of_the_three_is_nothing_it_is_at_the_target_and_with_one_beyond_it_is_not) {
+    const profile_limits_t limits = limits_of({16.0, 160.0, 160.0, 16e3});
+    const int64_t target = INT64_C(1) << 40;
+    for (const int64_t sign : {1, -1}) {
+        for (int more = 0; more < 4; more++) { // which of the three is larger by one; the last: none
+            profile_t profile;
+            profile_begin(&profile, target);
+            profile.end = {target + sign * (NOTHING + (more == 0)), sign * (NOTHING + (more == 1)),
+                           sign * (NOTHING + (more == 2))};
+            const profile_state_t before = profile.end;
+            tick(limits, &profile, target);
+            EXPECT_EQ(profile.start.x, more == 3 ? target : before.x) << more;
+            EXPECT_EQ(profile.start.v, more == 3 ? 0 : before.v) << more;
+            EXPECT_EQ(profile.start.a, more == 3 ? 0 : before.a) << more;
+            for (int k = 0; k < 8; k++) {
+                tick(limits, &profile, target);
+            }
+            EXPECT_TRUE(profile_arrived(&profile, target)) << more;
+        }
+    }
+}
+
 TEST(PositionProfile, stop_is_where_an_integration_ends) {
     std::mt19937 random(2);
     const auto draw = [&](double low, double high) {

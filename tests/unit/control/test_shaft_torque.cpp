@@ -95,6 +95,15 @@ TEST_F(ShaftTorque, is_1_without_strong_changes_that_the_acceleration_follows) {
     EXPECT_NEAR(factor(), 1.05 - 1.0 / 80.0, 2e-4);
 }
 
+TEST_F(ShaftTorque, a_torque_against_which_the_shaft_accelerates_counts_nothing) {
+    windows(200, -1.0, 1.0);
+    EXPECT_EQ(factor(), 1.0);
+    EXPECT_EQ(state.variance, 0);
+    EXPECT_EQ(state.covariance, 0);
+    windows(1, 1.0, 1.0);
+    EXPECT_GT(state.variance, 0);
+}
+
 TEST_F(ShaftTorque, counts_a_window_once) {
     windows(1, 1.05, 1.0);
     const int64_t variance = state.variance;

@@ -248,6 +248,28 @@ TEST_F(TableScale, is_not_learned_from_small_currents_lost_periods_or_hardly_any
     EXPECT_NEAR(scale(), 1.2, 0.004);
 }
 
+TEST_F(TableScale, is_not_learned_from_a_conduction_longer_than_its_sums_hold_and_from_the_next_one_again) {
+    const table_scale_sample_t zero = {.zero = true, .none = true};
+    table_scale_add(&state, 0, &zero, LEAST_Q9);
+    table_scale_sample_t sample = {.current_q9 = 80 * 512, .flux_q29 = 1 << 28, .table_q29 = 1 << 27, .periods = 255};
+    int whole = 0;
+    for (int k = 0; k < 1000000 && state.phase[0].whole; k++) {
+        table_scale_add(&state, 0, &sample, LEAST_Q9);
+        whole++;
+    }
+    EXPECT_GT(whole, 10000) << "some minutes";
+    EXPECT_LT(whole, 1000000);
+    const int64_t charge = state.phase[0].charge_q10;
+    table_scale_add(&state, 0, &sample, LEAST_Q9);
+    EXPECT_EQ(state.phase[0].charge_q10, charge) << "it ends";
+    table_scale_add(&state, 0, &zero, LEAST_Q9);
+    EXPECT_EQ(state.intervals, 0u);
+    EXPECT_TRUE(state.phase[0].whole);
+    intervals(1);
+    table_scale_add(&state, 0, &zero, LEAST_Q9);
+    EXPECT_EQ(state.intervals, 1u);
+}
+
 TEST(TableScaleFactors, are_the_scale_and_its_inverse_and_exact_for_1) {
     const flux_observer_parameters_t flux = {.gain_q30 = 1 << 28, .resistance_period_q40 = to_fixed(1.25e-6, Q40)};
     const int32_t period_q40 = to_fixed(PERIOD_S, Q40);

@@ -1,4 +1,5 @@
 // The deferred step: hand-over of the input, late and skipped steps, resets while a step is pending, starvation.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -681,6 +682,31 @@ TEST_F(Deferred, while_counts_are_slow_a_load_limits_the_braking_torque_of_speed
         ASSERT_TRUE(results().slow_counts.slow);
         EXPECT_EQ(results().speed.torque_min_q24, torque_mode ? -(2 << 24) : 0);
         EXPECT_EQ(results().speed.torque_max_q24, torque_mode ? -(2 << 24) : state.deferred.conduction.torque_max_q24);
+    }
+}
+
+TEST_F(Deferred, while_counts_are_slow_a_misalignment_by_the_flux_linkage_is_learned_beyond_what_excuses_it) {
+    constexpr double DEGREE = 0x1p32 / 360.0;
+    for (const double told_deg : {0.0, 0.02, -0.02, 10.0, -10.0}) {
+        state = {};
+        configure(DRIVE_CONTROLLER_SALIENT);
+        parameters.slow_counts = configured(DRIVE_CONTROLLER_SALIENT, uint32_t(RATE_HZ), 12).slow_counts;
+        start();
+        for (unsigned k = 0; k < RATE_HZ / 4; k++) {
+            std::fill(std::begin(state.flux_misalignment), std::end(state.flux_misalignment),
+                      int32_t(told_deg * DEGREE));
+            period(COMMAND_RUN);
+        }
+        ASSERT_TRUE(results().slow_counts.slow);
+        for (unsigned phase = 0; phase < machine_tables.phases; phase++) {
+            const double offset_deg = state.deferred.misalignment.phase[phase].offset / DEGREE;
+            if (std::fabs(told_deg) < 1.0) {
+                EXPECT_EQ(offset_deg, 0.0) << told_deg;
+            } else {
+                EXPECT_GT(offset_deg / told_deg, 0.0) << told_deg;
+                EXPECT_LT(offset_deg / told_deg, 1.0) << told_deg;
+            }
+        }
     }
 }
 

@@ -138,6 +138,20 @@ TEST_F(AngleEvidence, the_tolerated_error_of_the_voltage_is_half_of_the_back_emf
 }
 
 // [SR-21]
+TEST_F(AngleEvidence, the_tolerated_error_grows_with_the_acceleration_up_to_a_million_rad_s2_and_no_further) {
+    const load_observer_model_t model = load_observer_model(RATE_HZ, to_fixed(0.02, Q30), 0);
+    const auto error_q29 = [&](int64_t acceleration) {
+        return angle_evidence_flux_error_q29(acceleration, 26 << 9, model.angle_step_q32, POLES);
+    };
+    const int64_t most = INT64_C(1) << 20;
+    EXPECT_NEAR(double(error_q29(most)), 2.0 * double(error_q29(most / 4)), 64.0 + double(error_q29(most)) * 1e-3);
+    EXPECT_GT(error_q29(most), error_q29(most - most / 16));
+    for (const int64_t more : {most + 1, 2 * most, int64_t(INT32_MAX), INT64_MAX}) {
+        EXPECT_EQ(error_q29(more), error_q29(most)) << more;
+    }
+}
+
+// [SR-21]
 TEST_F(AngleEvidence, a_rotor_that_accelerates_while_the_encoder_does_not_count_is_found_after_1_to_4_degrees) {
     for (const double start_deg : {55.0, 65.0, 75.0}) {
         monitor = {};

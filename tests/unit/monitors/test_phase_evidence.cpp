@@ -208,6 +208,52 @@ TEST_F(PhaseEvidence, a_current_that_ends_or_does_not_begin_is_the_sensors_when_
     }
 }
 
+// The same as it ends, and phase 1 some time later. [SR-26] [SR-27]
+TEST_F(PhaseEvidence, a_current_that_has_ended_explains_another_for_2_ms_and_not_again_when_the_periods_come_round) {
+    input.electrical = MIDDLE;
+    for (const uint32_t later : {4u, 60u, 100u, 8000u, UINT32_MAX}) {
+        monitor = {};
+        for (int k = 0; k < 20; k++) {
+            set(0, 10.0, table_Wb(10.0));
+            input.current_q9[1] = 0;
+            ASSERT_EQ(step(), 0u);
+        }
+        set(0, 0.0, table_Wb(10.0));
+        input.off[0] = true;
+        ASSERT_EQ(step(), 0u);
+        const uint32_t ended = input.periods;
+        set(0, 0.0, 0.0);
+        input.off[0] = true;
+        for (uint32_t to = 1; to < later; to += to < later - to ? to : later - to) {
+            input.periods = ended + to - 1;
+            ASSERT_EQ(step(), 0u) << later;
+        }
+        input.periods = ended + later - 1;
+        const int periods = periods_to_fault(100, [&](int k) { input.current_q9[1] = (10 + k) * 512; });
+        EXPECT_GE(periods, 9) << later;
+        EXPECT_LE(periods, 13) << later;
+        EXPECT_EQ(failed, FAULT_BIT(later <= 60 ? FAULT_CURRENT_SENSOR : FAULT_PHASE_SHORTED)) << later;
+    }
+}
+
+// Its switches are on; the unaligned position has the least flux linkage. [SR-27]
+TEST_F(PhaseEvidence, a_current_without_the_flux_linkage_that_it_has_at_any_angle_is_a_shorted_phase) {
+    for (const double part : {0.0, 0.9}) {
+        monitor = {};
+        const int periods = periods_to_fault(100, [&](int k) {
+            const double current_A = 50.0 + 0.125 * k;
+            set(0, current_A, part * table_Wb(current_A));
+        });
+        EXPECT_EQ(periods > 0, part < 0.5) << part;
+        EXPECT_EQ(failed, part < 0.5 ? FAULT_BIT(FAULT_PHASE_SHORTED) : 0u) << part;
+        if (part < 0.5) {
+            EXPECT_GE(periods, 10);
+            EXPECT_LE(periods, 13);
+            EXPECT_EQ(monitor.phases, 1u);
+        }
+    }
+}
+
 // Both switches open at the aligned position: parts of what the voltage removes, less its tolerance for delays. [SR-27]
 TEST_F(PhaseEvidence, a_current_that_falls_by_less_than_a_quarter_of_what_the_voltage_removes_is_a_shorted_phase) {
     for (const double part : {0.1, 0.21, 0.26, 0.5}) {
