@@ -2,8 +2,8 @@
 
 #include "fixed/compiler.h"
 
-/* The last row that begins at or before an entry; CANOPEN_ROWS: none. */
-static unsigned last_before(unsigned index, unsigned sub) {
+/* Number of rows that begin at or before an entry. */
+static unsigned rows_until(unsigned index, unsigned sub) {
     unsigned low = 0, high = CANOPEN_ROWS;
     while (low < high) {
         const unsigned middle = (low + high) / 2u;
@@ -14,16 +14,16 @@ static unsigned last_before(unsigned index, unsigned sub) {
             high = middle;
         }
     }
-    return low == 0 ? CANOPEN_ROWS : low - 1u;
+    return low;
 }
 
 /* First index of those alike; 0: there is no such object. */
 static unsigned base_index(unsigned index) {
-    const unsigned at = last_before(index, UINT8_MAX);
-    if (at == CANOPEN_ROWS) {
+    const unsigned rows = rows_until(index, UINT8_MAX);
+    if (rows == 0) {
         return 0;
     }
-    const canopen_row_t *row = &canopen_rows[at];
+    const canopen_row_t *row = &canopen_rows[rows - 1u];
     return index - row->index < row->instances ? row->index : 0;
 }
 
@@ -33,7 +33,7 @@ static void find_parameter(unsigned index, canopen_object_t *object) {
                                   .instances = 1,
                                   .count = 1,
                                   .type = CANOPEN_I32,
-                                  .access = CANOPEN_READ | CANOPEN_WRITE | CANOPEN_TPDO | CANOPEN_FROM,
+                                  .access = CANOPEN_WRITE | CANOPEN_TPDO | CANOPEN_FROM,
                                   .value = CANOPEN_FROM_PARAMETER,
                                   .minimum = limits->minimum,
                                   .maximum = limits->maximum};
@@ -52,12 +52,11 @@ COLD uint32_t canopen_find(unsigned index, unsigned sub, canopen_object_t *objec
     if (base == 0) {
         return CANOPEN_NO_OBJECT;
     }
-    const unsigned at = last_before(base, sub);
-    if (at == CANOPEN_ROWS || canopen_rows[at].index != base ||
-        sub - canopen_rows[at].first >= canopen_rows[at].count) {
+    const canopen_row_t *row = &canopen_rows[rows_until(base, sub) - 1u]; /* each object has an entry 0 */
+    if (sub - row->first >= row->count) {
         return CANOPEN_NO_ENTRY;
     }
-    object->row = canopen_rows[at];
+    object->row = *row;
     object->instance = (uint8_t)(index - base);
     object->element = (uint8_t)(sub - object->row.first);
     return CANOPEN_DONE;

@@ -100,15 +100,17 @@ static void store(canopen_t *canopen, const canopen_context_t *context) {
     respond(canopen, context, STORE, verdict.status == PARAMETER_STATUS_DONE ? DONE : STORE_FAILED);
 }
 
+static void configure_node(canopen_t *canopen, const canopen_context_t *context, uint8_t node) {
+    const bool allowed = (node >= 1u && node <= CANOPEN_NODE_MAX) || node == CANOPEN_NODE_NONE;
+    canopen->lss.node = allowed ? node : canopen->lss.node;
+    respond(canopen, context, CONFIGURE_NODE, allowed ? DONE : REFUSED);
+}
+
 static void configure(canopen_t *canopen, const canopen_context_t *context, const uint8_t *data) {
-    canopen_lss_t *lss = &canopen->lss;
     switch (data[0]) {
-    case CONFIGURE_NODE: {
-        const bool allowed = (data[1] >= 1u && data[1] <= CANOPEN_NODE_MAX) || data[1] == CANOPEN_NODE_NONE;
-        lss->node = allowed ? data[1] : lss->node;
-        respond(canopen, context, CONFIGURE_NODE, allowed ? DONE : REFUSED);
+    case CONFIGURE_NODE:
+        configure_node(canopen, context, data[1]);
         break;
-    }
     case CONFIGURE_BIT_RATE:
         respond(canopen, context, CONFIGURE_BIT_RATE, REFUSED);
         break;

@@ -50,6 +50,7 @@ static uint32_t error_count(const canopen_t *canopen, const canopen_context_t *c
     return newest > canopen->error_base ? fixed_min_u32(newest - canopen->error_base, ERRORS_MAX) : 0;
 }
 
+/* 0: there is no such fault, or its entry of the log cannot be read. */
 static int32_t error_field(const canopen_t *canopen, const canopen_context_t *context, unsigned element) {
     nvm_store_fault_t fault;
     if (element >= error_count(canopen, context) ||
@@ -77,10 +78,8 @@ static int32_t read_position(const canopen_t *canopen, const canopen_context_t *
         return canopen_distance_units(canopen, parameters[PARAMETER_POSITION_WINDOW_DEG], WINDOWS_PER_REV);
     case CANOPEN_FROM_HOMING_METHOD:
         return canopen_homing_number(parameters[PARAMETER_HOMING_METHOD]);
-    case CANOPEN_FROM_HOMING_SPEED:
+    default: /* CANOPEN_FROM_HOMING_SPEED */
         return canopen_rpm_units(canopen, parameters[PARAMETER_HOMING_SPEED_RPM]);
-    default:
-        return 0;
     }
 }
 
@@ -148,13 +147,11 @@ static int32_t read_from(const canopen_t *canopen, const canopen_context_t *cont
 COLD uint32_t canopen_read(const canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object,
                            int32_t *value) {
     const unsigned slot = canopen_slot(object);
-    if ((object->row.access & CANOPEN_READ) == 0) {
-        return CANOPEN_WRITE_ONLY;
-    }
+    const bool from = (object->row.access & CANOPEN_FROM) != 0;
     *value = (object->row.access & CANOPEN_CONSTANT) != 0 ? object->row.initial
              : slot < CANOPEN_VALUE_COUNT                 ? canopen->values[slot]
                                                           : read_from(canopen, context, object);
-    return CANOPEN_DONE;
+    return from && object->row.value == CANOPEN_FROM_ERROR_FIELD && *value == 0 ? CANOPEN_NO_DATA : CANOPEN_DONE;
 }
 
 static uint32_t check_limits(const canopen_object_t *object, int32_t value) {
@@ -164,11 +161,18 @@ static uint32_t check_limits(const canopen_object_t *object, int32_t value) {
     return below ? CANOPEN_BELOW : above ? CANOPEN_ABOVE : CANOPEN_DONE;
 }
 
-/* Store and restore have a signature. */
+/* Store and restore have a signature; of errors none but the deletion of all is written (CiA 301, 7.5.2.4). */
 static uint32_t check_signature(const canopen_object_t *object, int32_t value) {
-    const bool wrong = (object->row.value == CANOPEN_FROM_STORE && value != SAVE) ||
-                       (object->row.value == CANOPEN_FROM_RESTORE && value != LOAD);
-    return wrong ? CANOPEN_NOT_STORED : CANOPEN_DONE;
+    switch (object->row.value) {
+    case CANOPEN_FROM_STORE:
+        return value == SAVE ? CANOPEN_DONE : CANOPEN_NOT_STORED;
+    case CANOPEN_FROM_RESTORE:
+        return value == LOAD ? CANOPEN_DONE : CANOPEN_NOT_STORED;
+    case CANOPEN_FROM_ERROR_COUNT:
+        return value == 0 ? CANOPEN_DONE : CANOPEN_VALUE;
+    default:
+        return CANOPEN_DONE;
+    }
 }
 
 /* A node is watched by one entry; one without a node or a time is not used (CiA 301, 7.5.2.19). */
@@ -246,6 +250,24 @@ static uint32_t write_parameter(const canopen_context_t *context, unsigned index
     return canopen_verdict(&verdict);
 }
 
+static uint32_t write_max_torque(const canopen_context_t *context, int32_t value) {
+    const int32_t raw = canopen_torque_q24(value * 1000);
+    const parameter_row_t *limits = parameters_row(PARAMETER_TORQUE_MAX_NM);
+    return raw > limits->maximum ? CANOPEN_ABOVE : write_parameter(context, PARAMETER_TORQUE_MAX_NM, raw);
+}
+
+/* A correct signature stores: not in a run, and no values that have changed in memory. */
+static uint32_t write_store(const canopen_context_t *context) {
+    if (context->conditions->running) {
+        return CANOPEN_STATE;
+    }
+    if (!parameters_intact(context->parameters)) {
+        return CANOPEN_HARDWARE;
+    }
+    parameter_store_save(context->store);
+    return CANOPEN_DONE;
+}
+
 /* Parameters of the position loop in units of the profile. */
 static uint32_t write_position(const canopen_t *canopen, const canopen_context_t *context,
                                const canopen_object_t *object, int32_t value) {
@@ -270,17 +292,10 @@ static uint32_t write_from(canopen_t *canopen, const canopen_context_t *context,
     switch (object->row.value) {
     case CANOPEN_FROM_PARAMETER:
         return write_parameter(context, object->instance, value);
-    case CANOPEN_FROM_MAX_TORQUE: {
-        const int32_t raw = canopen_torque_q24(value * 1000);
-        const parameter_row_t *limits = parameters_row(PARAMETER_TORQUE_MAX_NM);
-        return raw > limits->maximum ? CANOPEN_ABOVE : write_parameter(context, PARAMETER_TORQUE_MAX_NM, raw);
-    }
+    case CANOPEN_FROM_MAX_TORQUE:
+        return write_max_torque(context, value);
     case CANOPEN_FROM_STORE:
-        if (context->conditions->running || !parameters_intact(context->parameters)) {
-            return CANOPEN_STATE;
-        }
-        parameter_store_save(context->store);
-        return CANOPEN_DONE;
+        return write_store(context);
     case CANOPEN_FROM_RESTORE:
         canopen->restore = true;
         return CANOPEN_DONE;

@@ -11,7 +11,7 @@ uint32_t canopen_size_of_bytes(const canopen_context_t *context, const canopen_o
 unsigned canopen_read_bytes(const canopen_context_t *context, const canopen_object_t *object, uint32_t offset,
                             uint8_t *data, unsigned bytes);
 
-/* Reads a number. CANOPEN_WRITE_ONLY. */
+/* Reads a number. CANOPEN_NO_DATA: an error field without an error; *value is 0. */
 uint32_t canopen_read(const canopen_t *canopen, const canopen_context_t *context, const canopen_object_t *object,
                       int32_t *value);
 

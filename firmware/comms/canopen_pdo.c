@@ -61,8 +61,12 @@ static bool pass_over(canopen_t *canopen, const canopen_context_t *context, unsi
 static void take(canopen_t *canopen, const canopen_context_t *context, unsigned pdos) {
     unsigned refused = 0;
     for (unsigned pdo = 0; pdo < CANOPEN_PDOS; pdo++) {
-        if ((pdos >> pdo & 1u) != 0 &&
-            (!pass_over(canopen, context, pdo, CHECK) || !pass_over(canopen, context, pdo, WRITE))) {
+        if ((pdos >> pdo & 1u) == 0) {
+            continue;
+        }
+        if (pass_over(canopen, context, pdo, CHECK)) {
+            (void)pass_over(canopen, context, pdo, WRITE);
+        } else {
             refused |= 1u << pdo;
         }
     }

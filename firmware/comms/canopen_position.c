@@ -139,8 +139,7 @@ static void step_homing(canopen_t *canopen, bool halted) {
     } else if (position->homing == CANOPEN_HOMING_WANTED && position->order == POSITION_ORDER_HALT &&
                follows(canopen)) {
         position->homing = CANOPEN_HOMING_RUNS;
-    } else if (position->homing == CANOPEN_HOMING_RUNS && position->order == POSITION_ORDER_HOME && follows(canopen) &&
-               !place->homing) {
+    } else if (position->homing == CANOPEN_HOMING_RUNS && follows(canopen) && !place->homing) {
         position->homing = place->homed && !place->homing_failed ? CANOPEN_HOMING_ATTAINED : CANOPEN_HOMING_FAILED;
     }
 }
@@ -249,6 +248,12 @@ COLD bool canopen_position_reached(const canopen_t *canopen, bool halted) {
     return halted ? stands : !position->moving && arrived(canopen);
 }
 
+/* Cyclic targets come in time, and the position loop follows them. */
+static bool follows_targets(const canopen_t *canopen) {
+    const uint32_t late_us = LATE_CYCLES * US_PER_MS * (uint32_t)canopen->values[CANOPEN_VALUE_INTERPOLATION];
+    return follows(canopen) && !canopen->place.following_error && canopen->position.silent_us <= late_us;
+}
+
 COLD bool canopen_position_acknowledged(const canopen_t *canopen, bool halted) {
     const canopen_position_t *position = &canopen->position;
     switch (canopen->drive.mode) {
@@ -256,10 +261,8 @@ COLD bool canopen_position_acknowledged(const canopen_t *canopen, bool halted) {
         return position->acknowledged;
     case CANOPEN_MODE_HOMING:
         return position->homing == CANOPEN_HOMING_ATTAINED;
-    default: {
-        const uint32_t late_us = LATE_CYCLES * US_PER_MS * (uint32_t)canopen->values[CANOPEN_VALUE_INTERPOLATION];
-        return !halted && follows(canopen) && !canopen->place.following_error && position->silent_us <= late_us;
-    }
+    default:
+        return !halted && follows_targets(canopen);
     }
 }
 

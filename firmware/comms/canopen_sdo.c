@@ -82,6 +82,10 @@ static void upload_segment(canopen_t *canopen, const canopen_context_t *context,
     }
     uint8_t response[8] = {0};
     const unsigned count = canopen_sdo_get(canopen, context, sdo->offset, response + 1, SEGMENT_BYTES);
+    if (count == 0) { /* by a change in memory: segments without an end */
+        canopen_sdo_abort(canopen, context, CANOPEN_NO_OBJECT);
+        return;
+    }
     sdo->offset += count;
     const bool last = sdo->offset >= sdo->size;
     response[0] = (uint8_t)((request[0] & TOGGLE) | (SEGMENT_BYTES - count) << 1 | (last ? LAST : 0));

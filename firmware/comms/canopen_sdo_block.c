@@ -103,7 +103,10 @@ COLD void canopen_sdo_block_step(canopen_t *canopen, const canopen_context_t *co
         if (at >= sdo->size) { /* the last one is on its way */
             break;
         }
-        (void)canopen_sdo_get(canopen, context, at, segment + 1, CANOPEN_BLOCK_BYTES);
+        if (canopen_sdo_get(canopen, context, at, segment + 1, CANOPEN_BLOCK_BYTES) == 0) { /* by a change in memory */
+            canopen_sdo_abort(canopen, context, CANOPEN_NO_OBJECT);
+            return;
+        }
         sdo->sequence++;
         segment[0] = (uint8_t)(sdo->sequence | (at + CANOPEN_BLOCK_BYTES >= sdo->size ? LAST : 0u));
         canopen_sdo_send(canopen, context, segment);

@@ -54,18 +54,19 @@ COLD uint32_t canopen_sdo_begin(canopen_t *canopen, const canopen_context_t *con
         return found;
     }
     sdo->size = size_of(context, object);
-    if ((object->row.access & (download ? CANOPEN_WRITE : CANOPEN_READ)) == 0) {
-        return download ? CANOPEN_READ_ONLY : CANOPEN_WRITE_ONLY;
+    if (download && (object->row.access & CANOPEN_WRITE) == 0) {
+        return CANOPEN_READ_ONLY;
     }
     if (is_set(object)) {
         return parameter_set_begin(context->set, context->parameters, false) ? CANOPEN_DONE : CANOPEN_HARDWARE;
     }
-    int32_t value = 0;
+    uint32_t read = CANOPEN_DONE;
     if (!download && canopen_bytes(object) != 0) {
-        (void)canopen_read(canopen, context, object, &value);
+        int32_t value;
+        read = canopen_read(canopen, context, object, &value);
         canopen_pack(sdo->buffer, canopen_bytes(object), value);
     }
-    return CANOPEN_DONE;
+    return read;
 }
 
 COLD bool canopen_sdo_put(canopen_t *canopen, const canopen_context_t *context, const uint8_t *data, unsigned count) {

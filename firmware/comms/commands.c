@@ -191,8 +191,7 @@ static bool follow_sender(commands_t *commands, unsigned data_id, const hal_can_
     case E2E_REPEATED: /* duplicated on the way, no evidence of a second sender */
         *rejection = reject(&counters->wrong_counter);
         return false;
-    case E2E_WRONG_SEQUENCE:
-    default:
+    default: /* E2E_WRONG_SEQUENCE */
         commands->contested = true;
         commands->contested_us = time_us;
         *rejection = reject_command(commands, &counters->wrong_counter);
@@ -271,8 +270,7 @@ static commands_frame_t receive_arming(commands_t *commands, hal_t *hal, const h
         return COMMANDS_ACCEPTED;
     case ARMING_CHALLENGED:
         return COMMANDS_ACCEPTED;
-    case ARMING_REFUSED:
-    default:
+    default: /* ARMING_REFUSED */
         return COMMANDS_REJECTED;
     }
 }

@@ -195,11 +195,8 @@ static bool receive(comms_t *comms, hal_t *hal, const comms_objects_t *objects, 
         case COMMANDS_XCP:
             receive_xcp(comms, hal, objects, &frame, time_us);
             break;
-        case COMMANDS_ACCEPTED:
-        case COMMANDS_REJECTED:
+        default: /* COMMANDS_ACCEPTED, COMMANDS_REJECTED */
             bus_monitor_check(&comms->bus, &frame, time_us);
-            break;
-        default:
             break;
         }
     }

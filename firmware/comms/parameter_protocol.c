@@ -56,8 +56,7 @@ void parameter_protocol_respond(const parameters_t *parameters, const hal_can_fr
         case PARAMETER_OPERATION_UNIT:
             response.value = text_part(parameters_unit(request.index), request.part);
             break;
-        case PARAMETER_OPERATION_READ:
-        default:
+        default: /* PARAMETER_OPERATION_READ */
             response.value = parameters->values[request.index];
             break;
         }

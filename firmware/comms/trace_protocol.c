@@ -29,13 +29,11 @@ static int32_t current_q9(const control_parameters_t *parameters, const fault_tr
 static uint16_t item_of_more(const control_parameters_t *parameters, const fault_trace_period_t *period,
                              unsigned number) {
     const unsigned quantity = number / MORE_PHASES, phase = FIRST_PHASES + number % MORE_PHASES;
-    if (phase >= HAL_PHASES_MAX) {
-        return 0;
-    }
-    if (quantity == 0) {
-        return (uint16_t)current_q9(parameters, period, phase);
-    }
-    return (uint16_t)duty_q15(parameters, quantity == 1 ? period->compare.upper[phase] : period->compare.lower[phase]);
+    const hal_pwm_compare_t *compare = &period->compare;
+    return phase >= HAL_PHASES_MAX ? 0
+           : quantity == 0         ? (uint16_t)current_q9(parameters, period, phase)
+           : quantity == 1         ? (uint16_t)duty_q15(parameters, compare->upper[phase])
+                                   : (uint16_t)duty_q15(parameters, compare->lower[phase]);
 }
 
 static uint16_t item(const control_parameters_t *parameters, const fault_trace_period_t *period, unsigned number) {

@@ -223,8 +223,7 @@ static xcp_error_t describe(xcp_t *xcp, const uint8_t *command, uint8_t *respons
         xcp_put_half_word(response + 4, daq->event);
         response[6] = daq->divider;
         return XCP_ERROR_NONE;
-    case GET_DAQ_CLOCK:
-    default: /* the time at which the command was received */
+    default: /* GET_DAQ_CLOCK: the time at which the command was received */
         xcp_put_word(response + 4, xcp->received_us);
         return XCP_ERROR_NONE;
     }
@@ -319,7 +318,7 @@ bool xcp_daq_next_frame(xcp_t *xcp, hal_can_frame_t *frame) {
     for (unsigned entry = odt->begin; entry < odt->end && entry < SAMPLER_CHANNELS_MAX; entry++) {
         const xcp_entry_t *of = &daq->entry[entry];
         for (unsigned i = 0; i < of->bytes && frame->length < sizeof frame->data; i++) {
-            frame->data[frame->length++] = (uint8_t)(daq->record[1u + entry] >> (8u * (of->first + i)));
+            frame->data[frame->length++] = (uint8_t)(daq->record[1u + entry] >> (8u * ((of->first + i) % WORD_BYTES)));
         }
     }
     return true;

@@ -1,5 +1,7 @@
 #include "comms/xcp_memory.h"
 
+#include <assert.h>
+
 #include "comms/xcp_code.h"
 #include "control/machine_tables.h"
 #include "layout_hash.h"
@@ -32,12 +34,13 @@ static void read_memory(const xcp_t *xcp, uint32_t offset, unsigned bytes, uint8
     }
 }
 
-/* Character of the identification: "salient" and, in hexadecimal, hashes of the headers and of the machine's DBC and
- * the size of the memory, which differs with the processor. */
+/* Character of the identification, 0 behind it: "salient" and, in hexadecimal, hashes of the headers and of the
+ * machine's DBC and the size of the memory, which differs with the processor. */
 static char identification(const xcp_t *xcp, unsigned at) {
     static const char name[] = "salient";
     const uint32_t numbers[] = {LAYOUT_HASH, machine_tables.dbc_hash, xcp->words};
     const unsigned first_digit = (unsigned)sizeof name - 1u;
+    static_assert(sizeof name + DIGITS * (sizeof numbers / sizeof numbers[0]) <= XCP_TEXT_BYTES, "has an end");
     if (at < first_digit) {
         return name[at];
     }
@@ -55,7 +58,7 @@ static char character(const xcp_t *xcp, unsigned text, unsigned at) {
 
 uint8_t xcp_text_length(const xcp_t *xcp, unsigned text) {
     uint8_t length = 0;
-    while (length < XCP_TEXT_BYTES && character(xcp, text, length) != '\0') {
+    while (character(xcp, text, length) != '\0') { /* which each text has */
         length++;
     }
     return length;

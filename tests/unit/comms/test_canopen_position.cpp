@@ -307,6 +307,26 @@ TEST_F(CanopenPosition, a_homing_ends_with_its_bit_and_with_a_halt) {
     }
 }
 
+TEST_F(CanopenPosition, a_homing_that_is_begun_anew_between_two_cycles_halts_first) {
+    begin(6);
+    control(ENABLE | NEW);
+    follow();
+    canopen.place.homing = true;
+    follow();
+    ASSERT_EQ(command.position.order, POSITION_ORDER_HOME);
+    const uint32_t before = command.position.sequence;
+    control(ENABLE);
+    control(ENABLE | NEW);
+    follow();
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+    EXPECT_EQ(command.position.sequence, before + 1);
+    canopen.place.homing = false;
+    follow();
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HOME) << "once the loop has seen the halt";
+    EXPECT_EQ(command.position.sequence, before + 2);
+    EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), 0u) << "under way";
+}
+
 TEST_F(CanopenPosition, each_write_is_a_cyclic_target) {
     begin(8);
     write(0x60C2, 1, 4);

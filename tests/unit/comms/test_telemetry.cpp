@@ -592,6 +592,33 @@ TEST_F(Comms, no_mailbox_is_lost_to_a_second_background_frame) {
               1);
 }
 
+// A message of a group that is due alone, and what keeps it from the queue.
+TEST(Telemetry, a_background_frame_needs_a_place_and_none_of_its_kind_before_it_an_idle_one_no_backlog_either) {
+    enum { NOTHING, QUEUED, IN_MAILBOX, FULL, BACKLOG, REASONS };
+    for (const auto group : {DRIVE_TELEMETRY_GROUP_BACKGROUND, DRIVE_TELEMETRY_GROUP_IDLE}) {
+        for (unsigned reason = NOTHING; reason < REASONS; reason++) {
+            telemetry_t telemetry;
+            telemetry_init(&telemetry, 0, 0);
+            bool due = false;
+            for (unsigned i = 0; i < DRIVE_TELEMETRY_MESSAGES; i++) {
+                const bool now = !due && drive_telemetry_messages[i].group == group;
+                telemetry.countdown[i] = now ? 0 : 1;
+                due = due || now;
+            }
+            ASSERT_TRUE(due);
+            telemetry.background_queued = reason == QUEUED;
+            telemetry.background_in_mailbox = reason == IN_MAILBOX;
+            telemetry.queue.count = reason == FULL ? FRAME_QUEUE_CAPACITY : reason == BACKLOG ? 1 : 0;
+            const unsigned before = telemetry.queue.count;
+            drive_telemetry_t values{};
+            telemetry_cycle(&telemetry, &values);
+            const bool taken = reason == NOTHING || (reason == BACKLOG && group == DRIVE_TELEMETRY_GROUP_BACKGROUND);
+            EXPECT_EQ(telemetry.queue.count, before + taken) << group << ", " << reason;
+            EXPECT_EQ(telemetry.dropped, taken ? 0 : 1) << group << ", " << reason;
+        }
+    }
+}
+
 TEST_F(Comms, missed_cycles_show_in_the_cycle_number_and_the_grid_stays) {
     run(2500);
     time_us = 7600; // the background was held up
@@ -657,6 +684,27 @@ TEST_F(Comms, one_call_processes_a_bounded_number_of_frames) {
     comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, 0);
     EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
     EXPECT_EQ(comms.commands.counters.unknown_frame, COMMS_FRAMES_PER_CALL);
+}
+
+TEST_F(Comms, one_call_of_canopen_processes_a_bounded_number_of_frames) {
+    nvm_store_t store{};
+    objects.store = &store;
+    comms_choose(&comms, 5, 0);
+    bus.received.assign(HAL_CAN_RECEIVE_QUEUE, hal_can_frame_t{0x123, false, false, 8, {}});
+    comms_background(&comms, &bus, &objects, DRIVE_STATE_READY, 0);
+    EXPECT_EQ(bus.received.size(), size_t(HAL_CAN_RECEIVE_QUEUE - COMMS_FRAMES_PER_CALL));
+}
+
+TEST_F(Comms, a_request_for_the_trace_is_answered_by_it) {
+    objects.trace = &drive.trace;
+    objects.control_parameters = &drive.control_parameters;
+    bus.received.push_back(request(PARAMETER_OPERATION_FAULT_TRACE, 0));
+    run(5000);
+    drive_parameter_response_t response{};
+    drive_parameter_response_unpack(&response, first(DRIVE_PARAMETER_RESPONSE_FRAME_ID).data, 8);
+    EXPECT_EQ(response.operation, PARAMETER_OPERATION_FAULT_TRACE);
+    EXPECT_EQ(response.status, PARAMETER_STATUS_NO_SUCH_ENTRY) << "no fault yet";
+    EXPECT_EQ(bus.count(DRIVE_PARAMETER_RESPONSE_FRAME_ID), 1u);
 }
 
 TEST_F(Comms, requests_without_room_for_a_response_are_dropped_and_counted_and_the_others_are_answered_in_order) {

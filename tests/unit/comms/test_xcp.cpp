@@ -166,6 +166,19 @@ TEST_F(Xcp, seeds_open_one_resource_once) {
     EXPECT_EQ(unlock(1), (bytes_t{0xFF, 0x00}));
 }
 
+// Which would read as unlocked, and as none.
+TEST_F(Xcp, a_seed_is_not_zero) {
+    connect();
+    uint32_t inverse = 1664525; // modulo 2^32, of the random numbers' factor
+    for (unsigned i = 0; i < 5; i++) {
+        inverse *= 2u - 1664525u * inverse;
+    }
+    last_seed = (0u - 1013904223u) * inverse;
+    EXPECT_EQ(send({0xF8, 0, 1}), (bytes_t{0xFF, 4} + word(1)));
+    EXPECT_EQ(last_seed, 0u) << "the random number";
+    EXPECT_EQ(send(bytes_t{0xF7, 4} + word(~1u)), (bytes_t{0xFF, 0x04}));
+}
+
 TEST_F(Xcp, a_wrong_key_a_late_one_and_that_of_another_seed_end_the_session) {
     const auto expect_refused = [this](const bytes_t &key) {
         EXPECT_EQ(send(key), failed(XCP_ERROR_ACCESS_LOCKED));
@@ -326,6 +339,16 @@ TEST_F(Xcp, reads_each_area_up_to_its_end_and_nothing_beyond) {
     EXPECT_EQ(send({0xF6, 0, 0, 1, 0, 0, 0, 0}), failed(XCP_ERROR_OUT_OF_RANGE)) << "an address extension";
     EXPECT_EQ(xcp.address, 16u);
     EXPECT_EQ(send({0xF4, 1, 0, 1, 0, 0, 0, 0}), failed(XCP_ERROR_OUT_OF_RANGE));
+}
+
+TEST_F(Xcp, bytes_across_the_end_of_an_area_are_not_read) {
+    for (unsigned area = 0; area < std::size(areas); area++) {
+        const uint32_t end = areas[area] + sizes[area];
+        uint8_t to[4];
+        EXPECT_TRUE(xcp_memory_read(&xcp, &drive->parameters, end - 4, 4, to)) << area;
+        EXPECT_FALSE(xcp_memory_read(&xcp, &drive->parameters, end - 3, 4, to)) << area;
+        EXPECT_FALSE(xcp_memory_read(&xcp, &drive->parameters, end, 1, to)) << area;
+    }
 }
 
 TEST_F(Xcp, blocks_of_any_size_have_the_bytes_of_the_memory_in_order) {

@@ -328,6 +328,52 @@ TEST(XcpBusAlone, an_upload_of_255_bytes_passes_beside_telemetry_on_any_node) {
     }
 }
 
+TEST(XcpBusAlone, an_upload_whose_address_has_changed_in_memory_ends_and_the_session_goes_on) {
+    World world;
+    world.bus.received.push_back(xcp_command({0xFF, 0}));
+    world.bus.received.push_back(xcp_command({0xF6, 0, 0, 0, 0, 0, 0, 0}));
+    world.bus.received.push_back(xcp_command({0xF5, 255}));
+    world.step();
+    ASSERT_GT(world.comms.xcp.upload_left, 0);
+    world.comms.xcp.address |= XCP_AREA;
+    for (unsigned k = 0; k < 4000; k++) {
+        world.step();
+    }
+    EXPECT_EQ(world.comms.xcp.upload_left, 0);
+    const size_t frames = world.sent(true).size();
+    EXPECT_GE(frames, 2u + 25) << "what was read before";
+    EXPECT_LT(frames, 2u + 37);
+    world.bus.received.push_back(xcp_command({0xFD}));
+    for (unsigned k = 0; k < 400; k++) {
+        world.step();
+    }
+    EXPECT_EQ(world.sent(true).size(), frames + 1);
+}
+
+TEST(XcpBusAlone, a_command_without_room_for_its_response_is_dropped_and_counted) {
+    World world;
+    world.bus.foreign = 1000;
+    for (unsigned i = 0; i < 40; i++) {
+        world.bus.received.push_back(frames::parameter_request(PARAMETER_OPERATION_READ, 0, 0, 0));
+    }
+    for (unsigned k = 0; k < 20; k++) {
+        world.step();
+    }
+    ASSERT_TRUE(world.bus.received.empty());
+    const unsigned dropped = world.comms.telemetry.dropped;
+    world.bus.received.push_back(xcp_command({0xFF, 0}));
+    world.step();
+    EXPECT_FALSE(world.comms.xcp.connected);
+    EXPECT_EQ(world.comms.telemetry.dropped, dropped + 1);
+    world.bus.foreign = 0;
+    for (unsigned k = 0; k < 4000; k++) {
+        world.step();
+    }
+    world.bus.received.push_back(xcp_command({0xFF, 0}));
+    world.step();
+    EXPECT_TRUE(world.comms.xcp.connected);
+}
+
 TEST(XcpBusAlone, remote_and_extended_frames_are_no_commands) {
     World world;
     hal_can_frame_t frame = xcp_command({0xFF, 0});

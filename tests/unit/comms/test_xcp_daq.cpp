@@ -258,6 +258,30 @@ TEST_F(XcpDaq, sends_no_rest_of_a_record_of_the_measurement_before) {
     EXPECT_EQ(next_frame(), bytes_t{});
 }
 
+TEST_F(XcpDaq, a_list_that_has_changed_in_memory_does_not_start) {
+    configure({{{0, 4}}});
+    ASSERT_LT(DRIVE_WORDS, 0xFFFFu);
+    xcp.daq.entry[0].word = 0xFFFF;
+    EXPECT_EQ(start_stop(1), failed(XCP_ERROR_DAQ_CONFIGURATION));
+    EXPECT_FALSE(xcp.daq.running);
+    EXPECT_EQ(drive->sampler.event, 0u);
+    xcp.daq.entry[0].word = 0;
+    EXPECT_EQ(start_stop(1), (bytes_t{0xFF, 0}));
+    EXPECT_TRUE(xcp.daq.running);
+}
+
+TEST_F(XcpDaq, a_frame_has_its_entries_and_eight_bytes_whatever_has_changed_in_memory) {
+    configure({{{0, 4}}});
+    ASSERT_EQ(start_stop(1), (bytes_t{0xFF, 0}));
+    const auto byte = [&](unsigned i) { return bytes()[i]; };
+    event(SAMPLER_EVENT_CONTROL);
+    xcp.daq.odt[0].end = 0xFF;
+    EXPECT_EQ(next_frame(), (bytes_t{0, byte(0), byte(1), byte(2), byte(3)})) << "the others are not written";
+    event(SAMPLER_EVENT_CONTROL);
+    xcp.daq.entry[0].bytes = 0xFF;
+    EXPECT_EQ(next_frame(), (bytes_t{0, byte(0), byte(1), byte(2), byte(3), byte(0), byte(1), byte(2)}));
+}
+
 TEST_F(XcpDaq, waits_for_the_mailboxes_and_lets_uploads_pass) {
     configure({{{0, 4}}});
     ASSERT_EQ(start_stop(1), (bytes_t{0xFF, 0}));

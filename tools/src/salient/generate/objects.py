@@ -50,7 +50,6 @@ enum {{
 
 /* Bits of canopen_row_t.access. */
 enum {{
-    CANOPEN_READ = 1,
     CANOPEN_WRITE = 2,
     CANOPEN_RPDO = 4,
     CANOPEN_TPDO = 8,
@@ -112,11 +111,11 @@ def header(dictionary: Dictionary) -> str:
 
 def _access(entry: Entry) -> str:
     bits = [name for name, has in (
-        ("CANOPEN_READ", entry.access != "wo"), ("CANOPEN_WRITE", entry.access in ("rw", "wo")),
-        ("CANOPEN_RPDO", "r" in entry.pdo), ("CANOPEN_TPDO", "t" in entry.pdo), ("CANOPEN_FROM", entry.source),
+        ("CANOPEN_WRITE", entry.access == "rw"), ("CANOPEN_RPDO", "r" in entry.pdo),
+        ("CANOPEN_TPDO", "t" in entry.pdo), ("CANOPEN_FROM", entry.source),
         ("CANOPEN_CONSTANT", not entry.source and not entry.value),
         ("CANOPEN_COMMUNICATION", entry.reset == "communication")) if has]
-    return " | ".join(bits)
+    return " | ".join(bits) or "0"
 
 
 def _bits(value: int) -> str:

@@ -15,7 +15,7 @@ TYPES = {"i8": 2, "i16": 3, "i32": 4, "u8": 5, "u16": 6, "u32": 7, "string": 9, 
 """Types of CiA 301 by their name in the file."""
 BITS = {"i8": 8, "i16": 16, "i32": 32, "u8": 8, "u16": 16, "u32": 32}
 KINDS = ("var", "array", "record")
-ACCESS = ("const", "ro", "rw", "wo")
+ACCESS = ("const", "ro", "rw")
 RESETS = ("communication", "node")
 PARAMETER_BASE = 0x2000
 """Index of the first parameter."""
