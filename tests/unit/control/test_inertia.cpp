@@ -89,8 +89,15 @@ TEST(Inertia, a_start_under_load_identifies_a_fifth_to_five_times_to_the_nearest
 // One count of the angle as torque: J0 d2(angle) / window^2.
 TEST(Inertia, beyond_a_quarter_and_four_times_the_shift_is_the_last_one_whatever_is_missing_to_the_next) {
     for (const bool fine : {false, true}) {
-        for (const auto &[gain, shift] : {std::pair{0.12, 2}, {0.15, 2}, {6.0, -2}, {7.0, -2}}) {
+        for (const auto &[gain, shift] : {std::pair{0.12, 2}, {0.15, 2}, {6.0, -2}, {7.0, -2}, {7.6, -2}}) {
             EXPECT_EQ(shift_after(settings(), gain, start, constant_8, nullptr, 1.0, fine), shift) << gain << fine;
+            inertia_t inertia{};
+            const auto longer = [](double t) { return t > 0.1 && std::fmod(t, 0.02) < 0.01 ? TORQUE_MAX : 8.0; };
+            EXPECT_EQ(shift_after(settings(), gain, longer, constant_8, &inertia, 1.0, fine), shift) << gain << fine;
+            const double part = shift > 0 ? 0.25 / gain : 4.0 / gain; // of which the rest is at most half and twice
+            if (fine) {
+                EXPECT_NEAR(inertia.rest_q14 / 16384.0, std::clamp(part, 0.5, 2.0), 0.05) << gain;
+            }
         }
     }
 }
