@@ -237,7 +237,7 @@ TEST_F(CanopenObjects, lss_stores_neither_in_a_run_nor_what_has_changed_in_memor
 
 // --- PDOs ------------------------------------------------------------------------------------------------------------
 
-// CiA 301, table of restricted CAN-IDs; below 0x180 those of SYNC, EMCY and TIME, too.
+// CiA 301, table of restricted CAN-IDs, and below 0x180 the defaults of SYNC, EMCY and TIME.
 TEST_F(CanopenObjects, identifiers_of_other_services_are_none_of_pdos) {
     for (unsigned id = 0; id < 0x800; id++) {
         const bool other = id <= 0x180 || (id > 0x580 && id < 0x600) || (id > 0x600 && id < 0x680) || id >= 0x6E0;
@@ -381,7 +381,7 @@ TEST_F(CanopenObjects, a_client_without_checksums_gets_none) {
         cycle();
         EXPECT_EQ(sent().front().data, (bytes_t{0x81, 0x92, 0x01, 0x02, 0, 0, 0, 0}));
         const bytes_t end = sdo({0xA2, 1, 10, 0, 0, 0, 0, 0});
-        EXPECT_EQ(end[0], 0xCD) << "three bytes of the segment are none";
+        EXPECT_EQ(end[0], 0xCD) << "three bytes of the segment do not count";
         EXPECT_EQ((end[1] | end[2]) != 0, check);
         sdo({0xA1, 0, 0, 0, 0, 0, 0, 0});
     }
