@@ -77,7 +77,7 @@ def test_every_source_of_the_firmware_has_tests_that_judge_it():
 
 
 def test_a_source_without_tests_of_its_name_is_judged_by_those_that_share_its_first_word():
-    assert mutants.finders("firmware/comms/canopen_sdo_block.c") == (
+    assert mutants.finders("firmware/comms/canopen_lss.c") == (
         "test_comms_canopen_drive", "test_comms_canopen_fuzz", "test_comms_canopen_objects", "test_comms_canopen_pdo",
         "test_comms_canopen_position", "test_comms_canopen_sdo", "test_drive")
 
