@@ -50,7 +50,7 @@ static void end_fault(state_machine_t *state_machine) {
 
 /* One more; a drive may stand in a fault for days. */
 static uint32_t saturated_count(uint32_t ticks) {
-    return ticks + (uint32_t)(ticks < UINT32_MAX);
+    return ticks < UINT32_MAX ? ticks + 1u : ticks;
 }
 
 /* [SR-39] [SR-41] [SR-42] [SR-43] */

@@ -113,7 +113,7 @@ COLD bool table_store_load(const hal_t *hal, uint32_t control_rate_hz, const mac
         for (unsigned i = 0; i < TABLE_WORDS; i++) {
             const uint64_t word = nvm_ring_payload(&ring, hal, place, i + 1u);
             const size_t at = i * WORD_BYTES, left = TABLE_STORE_BYTES - at;
-            (void)memcpy((char *)tables + at, &word, left < WORD_BYTES ? left : WORD_BYTES);
+            (void)memcpy(&((char *)tables)[at], &word, left < WORD_BYTES ? left : WORD_BYTES);
         }
         if (table_store_usable(tables, built_in, control_rate_hz)) {
             return true;
