@@ -223,8 +223,42 @@ class Drive : public testing::Test {
   protected:
     void SetUp() override {
         hal.adc.bus_voltage_counts = 240 * 8;
-        const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
+        start(DRIVE_CONTROLLER_PAPER);
+    }
+
+    // Starts the drive anew.
+    void start(drive_controller_t controller, bool stored_tables = false) {
+        const drive_config_t config = {
+            .control_rate_hz = 40000, .controller = controller, .stored_tables = stored_tables};
         ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    }
+
+    // The same, which runs on without phase b.
+    void start_without_phase_b() {
+        ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
+        parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
+        periods(100);
+        drive.degraded.lost = 2u;
+        drive.control.lost_phase = 2u;
+    }
+
+    // The response to a command of XCP, and the passes of the background until it came; {}: none in PASSES_MAX.
+    std::vector<uint8_t> xcp(const std::vector<uint8_t> &bytes) {
+        hal_can_frame_t frame{};
+        frame.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
+        frame.length = uint8_t(bytes.size());
+        std::copy(bytes.begin(), bytes.end(), frame.data);
+        hal.from_drive.clear();
+        hal.to_drive.push_back(frame);
+        for (passes = 1; passes <= PASSES_MAX; passes++) {
+            periods(1);
+            for (const hal_can_frame_t &sent : hal.from_drive) {
+                if (sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID) {
+                    return {sent.data, sent.data + sent.length};
+                }
+            }
+        }
+        return {};
     }
 
     // The deferred interrupt, when it is requested.
@@ -346,6 +380,8 @@ class Drive : public testing::Test {
 
     hal_t hal;
     drive_t drive;
+    static constexpr unsigned PASSES_MAX = 100;
+    unsigned passes = 0;
     uint8_t counter = 0;
     double flux_Wb[3] = {};
     unsigned acting_ticks[3] = {};
@@ -395,8 +431,7 @@ TEST_F(Drive, lines_of_the_torque_off_that_differ_for_200_ms_are_a_failed_check_
 TEST_F(Drive,
        what_a_run_has_learned_of_the_phases_is_of_those_that_the_machine_has_and_no_misalignment_is_left_after_it) {
     hal.open = true;
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     command(COMMAND_RUN);
     run(0.05);
@@ -979,8 +1014,7 @@ TEST_F(Drive, a_lost_phase_comes_back_outside_of_the_run_when_running_without_it
 }
 
 TEST_F(Drive, a_position_command_reaches_the_interrupt_with_the_parameter_s_homing_and_telemetry_has_its_state) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     hal.to_drive.push_back(frames::position_command(++counter, COMMAND_RUN, POSITION_ORDER_PROFILE, 1 << 16));
     arm_for_run(7);
@@ -1013,8 +1047,7 @@ TEST_F(Drive, a_position_command_reaches_the_interrupt_with_the_parameter_s_homi
 }
 
 TEST_F(Drive, an_experiment_drives_its_phase_and_is_over_with_its_limit_or_without_commands) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     const auto experiment = [this](uint8_t number) {
         hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_PULSE, 1, number));
@@ -1081,12 +1114,7 @@ TEST_F(Drive, an_experiment_on_a_rotor_that_turns_is_over_with_any_other_request
 
 // [SR-31]
 TEST_F(Drive, an_experiment_closes_no_switch_of_a_lost_phase) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
-    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
-    periods(100);
-    drive.degraded.lost = 2u;
-    drive.control.lost_phase = 2u;
+    ASSERT_NO_FATAL_FAILURE(start_without_phase_b());
     uint8_t number = 0;
     for (const uint8_t phase : {1, 2, 1}) {
         for (const unsigned kind : {IDENTIFY_KIND_PULSE, IDENTIFY_KIND_HOLD}) {
@@ -1109,12 +1137,7 @@ TEST_F(Drive, an_experiment_closes_no_switch_of_a_lost_phase) {
 
 // An experiment is one number's: whatever comes with the number of the present one changes nothing. [SR-31]
 TEST_F(Drive, an_experiment_goes_on_as_it_began_until_another_number_comes_and_closes_no_switch_of_a_lost_phase) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
-    parameters_set(&drive.parameters, PARAMETER_DEGRADED_RUNNING, 1);
-    periods(100);
-    drive.degraded.lost = 2u;
-    drive.control.lost_phase = 2u;
+    ASSERT_NO_FATAL_FAILURE(start_without_phase_b());
     const auto pulse = [this](unsigned phase, uint8_t number, uint16_t begin, uint16_t width) {
         hal.to_drive.push_back(frames::identify_window(++counter, begin, width));
         hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_PULSE, phase, number));
@@ -1188,8 +1211,7 @@ TEST_F(Drive, an_experiment_loses_no_phase_by_tables_that_need_not_be_the_machin
 }
 
 TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_TRADITIONAL};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config)); // experiments are the controller salient's
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_TRADITIONAL)); // experiments are the controller salient's
     periods(100);
     hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_HOLD, 1));
     arm_for_run(7);
@@ -1204,8 +1226,7 @@ TEST_F(Drive, an_experiment_that_has_met_a_limit_withdraws_its_command) {
 }
 
 TEST_F(Drive, an_experiment_begins_after_a_run_that_a_limit_has_ended) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     for (const uint8_t arming_counter : {7, 17}) {
         hal.to_drive.push_back(frames::identify_command(++counter, COMMAND_RUN, IDENTIFY_KIND_REST, 1));
@@ -1223,8 +1244,7 @@ TEST_F(Drive, an_experiment_begins_after_a_run_that_a_limit_has_ended) {
 }
 
 TEST_F(Drive, the_end_of_an_experiment_withdraws_no_command_but_its_own) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     for (const command_request_t request : {COMMAND_STOP, COMMAND_IDENTIFY}) {
         drive.identify.begun = true; // between the interrupt that has ended it and the next one
@@ -1239,8 +1259,7 @@ TEST_F(Drive, the_end_of_an_experiment_withdraws_no_command_but_its_own) {
 // Torque that would carry the speed beyond the last reference ends at once; towards it, and in torque mode, it ramps.
 // [SR-04]
 TEST_F(Drive, without_commands_no_torque_carries_the_speed_beyond_its_reference_in_either_direction) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     command(COMMAND_RUN);
     periods(3);
@@ -1562,11 +1581,9 @@ TEST_F(Drive, checks_phases_and_encoder_in_each_four_control_periods_or_as_soon_
     }
 }
 
-// [SR-46]
 // [SR-24]
 TEST_F(Drive, a_rotor_held_at_its_place_is_not_pushed_in_vain_and_one_beside_it_or_under_way_is) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     command(COMMAND_RUN);
     run(0.02);
@@ -1605,8 +1622,7 @@ TEST_F(Drive, a_rotor_held_at_its_place_is_not_pushed_in_vain_and_one_beside_it_
 }
 
 TEST_F(Drive, the_shaft_s_torque_is_learned_in_torque_mode_with_known_scale_and_inertia_and_used_where_chosen) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     command(COMMAND_RUN);
     run(0.02);
@@ -1660,8 +1676,7 @@ TEST_F(Drive, the_shaft_s_torque_is_learned_in_torque_mode_with_known_scale_and_
 }
 
 TEST_F(Drive, a_misalignment_by_the_flux_linkage_is_solved_when_a_phase_has_enough_samples_and_before_it_is_kept) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     command(COMMAND_RUN);
     periods(200);
@@ -1802,6 +1817,7 @@ TEST_F(DriveInterrupted, interrupts_that_leave_no_time_for_a_sample_let_the_chec
 }
 #endif
 
+// [SR-46]
 TEST_F(Drive, lost_interrupts_reach_the_protection) {
     periods(100);
     command(COMMAND_RUN);
@@ -1850,8 +1866,7 @@ TEST_F(Drive, the_record_of_a_fault_has_the_angle_that_the_laws_use_up_to_the_pe
     hal.encoder_bits = 10;
     hal.encoder_counts = 300;
     hal.open = true;
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_PAPER));
     periods(100);
     hal.encoder_counts = 301;
     hal.break_causes = HAL_PWM_BREAK_STO_1 | HAL_PWM_BREAK_STO_2;
@@ -1923,8 +1938,7 @@ TEST_F(Drive, processor_time_is_recorded_and_reported_without_any_reaction) {
 TEST_F(Drive, a_board_with_another_timer_clock_has_its_ticks_and_the_same_microseconds) {
     hal.clock_hz = 170000000;
     hal.open = true;
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_PAPER));
     EXPECT_EQ(hal.starts.back(), 2125);
     hal.elapsed_ticks = 1700; // 10 us
     periods(100);
@@ -2090,8 +2104,7 @@ TEST_F(Drive, a_fault_that_an_interrupt_clears_while_it_is_logged_is_no_entry_wi
 }
 
 TEST_F(Drive, the_recorder_has_each_event_s_periods_and_no_other_s) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     sampler_setup_t setup{};
     setup.channels = 1;
@@ -2121,8 +2134,7 @@ TEST_F(Drive, the_recorder_has_each_event_s_periods_and_no_other_s) {
 }
 
 TEST_F(Drive, a_position_command_during_a_move_keeps_the_torque_that_the_load_left_before_it) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     for (const int32_t moves : {1, -1, 0}) {
         drive.left_q14 = 1234;
@@ -2271,28 +2283,7 @@ class DriveWithTables : public Drive {
   protected:
     void SetUp() override {
         hal.adc.bus_voltage_counts = 240 * 8;
-        const drive_config_t config = {
-            .control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_PAPER, .stored_tables = true};
-        ASSERT_TRUE(drive_init(&drive, &hal, &config));
-    }
-
-    // The response, and the passes of the background until it came; {} after PASSES_MAX without one.
-    std::vector<uint8_t> xcp(std::vector<uint8_t> bytes) {
-        hal_can_frame_t frame{};
-        frame.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
-        frame.length = uint8_t(bytes.size());
-        std::copy(bytes.begin(), bytes.end(), frame.data);
-        hal.from_drive.clear();
-        hal.to_drive.push_back(frame);
-        for (passes = 1; passes <= PASSES_MAX; passes++) {
-            periods(1);
-            for (const hal_can_frame_t &sent : hal.from_drive) {
-                if (sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID) {
-                    return {sent.data, sent.data + sent.length};
-                }
-            }
-        }
-        return {};
+        start(DRIVE_CONTROLLER_PAPER, true);
     }
 
     void unlock() {
@@ -2303,9 +2294,7 @@ class DriveWithTables : public Drive {
         ASSERT_EQ(unlocked.at(0), 0xFF);
     }
 
-    static constexpr unsigned PASSES_MAX = 100;
     static constexpr unsigned LATER = 2; // passes after the operations: the response is made, and sent
-    unsigned passes = 0;
 };
 
 // [SR-61]
@@ -2330,17 +2319,9 @@ TEST_F(DriveWithTables, answers_a_command_that_writes_the_memory_when_the_memory
 }
 
 TEST_F(Drive, without_a_memory_of_tables_programming_is_no_resource) {
-    hal_can_frame_t connect{};
-    connect.identifier = DRIVE_XCP_COMMAND_FRAME_ID;
-    connect.length = 2;
-    connect.data[0] = 0xFF;
-    hal.to_drive.push_back(connect);
-    periods(2);
-    const auto response = std::find_if(hal.from_drive.begin(), hal.from_drive.end(), [](const hal_can_frame_t &sent) {
-        return sent.identifier == DRIVE_XCP_RESPONSE_FRAME_ID;
-    });
-    ASSERT_NE(response, hal.from_drive.end());
-    EXPECT_EQ(response->data[1], XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ);
+    const std::vector<uint8_t> response = xcp({0xFF, 0});
+    ASSERT_EQ(response.size(), 8u);
+    EXPECT_EQ(response[1], XCP_RESOURCE_CALIBRATION | XCP_RESOURCE_DAQ);
 }
 
 // [SR-56]
@@ -2916,8 +2897,7 @@ TEST_F(Drive, telemetry_reports_in_a_run_that_a_reference_backwards_is_limited_w
 }
 
 TEST_F(Drive, the_background_leaves_what_belongs_to_no_phase_of_the_machine_as_it_is) {
-    const drive_config_t config = {.control_rate_hz = 40000, .controller = DRIVE_CONTROLLER_SALIENT};
-    ASSERT_TRUE(drive_init(&drive, &hal, &config));
+    ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     ASSERT_LT(machine_tables.phases, HAL_PHASES_MAX);
     const unsigned beyond = machine_tables.phases;
     table_scale_phase_t &interval = drive.table_scale.phase[beyond];

@@ -1,7 +1,5 @@
 // Contract of the host's port (hal/) on its board: the watchdog.
-#include <gtest/gtest.h>
-
-#include "support/emulator_machines.h"
+#include "support/emulated_board.h"
 
 extern "C" {
 #include "hal_nvm.h"
@@ -13,21 +11,13 @@ namespace {
 
 constexpr uint64_t NS_PER_US = 1000, TIMEOUT_NS = HAL_WATCHDOG_TIMEOUT_US * NS_PER_US;
 
-class HalHost : public testing::Test {
+class HalHost : public EmulatedBoard {
   protected:
-    HalHost() : machine(machine_of(MAGNETICS_LINEAR_COSINE)) {
-        plant_init(&plant, &machine, 0.3);
-        sensors_init(&sensors, &machine.sensors, 17, 12, 1);
-        board_init(&board, &plant, &sensors, &bus, 0, 1);
+    HalHost() {
         nvm_init(&board.nvm);
         board.context = BOARD_BACKGROUND;
     }
 
-    machine_t machine;
-    plant_t plant;
-    sensors_t sensors;
-    can_bus_t bus;
-    board_t board;
     hal_t hal{&board};
 };
 

@@ -343,7 +343,6 @@ TEST_F(StateMachine, ten_milliseconds_begin_after_the_fault_itself_when_it_lasts
 }
 
 // [SR-41]
-// [SR-41]
 TEST_F(StateMachine, a_fault_whose_cause_has_been_gone_for_days_is_cleared_at_once) {
     run();
     step(COMMAND_OFF, FAULT_BIT(FAULT_OVER_VOLTAGE));
@@ -355,6 +354,7 @@ TEST_F(StateMachine, a_fault_whose_cause_has_been_gone_for_days_is_cleared_at_on
     EXPECT_EQ(step(COMMAND_CLEAR_FAULT), DRIVE_STATE_READY);
 }
 
+// [SR-41]
 TEST_F(StateMachine, a_cause_that_returns_within_ten_milliseconds_cancels_the_request_to_clear) {
     run();
     step(COMMAND_RUN, FAULT_BIT(FAULT_OVER_VOLTAGE));

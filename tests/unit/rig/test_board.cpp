@@ -1,11 +1,8 @@
 // Conversions and clocks of a board (rig/board.h): temperatures in turn, the second clock.
-#include <gtest/gtest.h>
-
-#include "support/emulator_machines.h"
+#include "support/emulated_board.h"
 
 extern "C" {
 #include "plant/pwm_timer.h"
-#include "rig/board.h"
 }
 
 namespace {
@@ -14,12 +11,9 @@ constexpr uint16_t TICKS = 2500;
 constexpr uint64_t PERIOD_NS = 2 * TICKS * PWM_TIMER_TICK_NS;
 constexpr unsigned SENSORS = 8; // of a board for four phases
 
-class Board : public testing::Test {
+class Board : public EmulatedBoard {
   protected:
-    Board() : machine(machine_of(MAGNETICS_LINEAR_COSINE)) {
-        plant_init(&plant, &machine, 0.3);
-        sensors_init(&sensors, &machine.sensors, 17, 12, 1);
-        board_init(&board, &plant, &sensors, &bus, 0, 1);
+    Board() {
         board_pwm_start(&board, TICKS);
         board_convert_temperatures(&board);
     }
@@ -45,12 +39,6 @@ class Board : public testing::Test {
         }
         return mask;
     }
-
-    machine_t machine;
-    plant_t plant;
-    sensors_t sensors;
-    can_bus_t bus;
-    board_t board;
 };
 
 TEST_F(Board, each_control_interrupt_has_the_temperature_that_was_sampled_in_the_one_before) {
