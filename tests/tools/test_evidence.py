@@ -86,6 +86,41 @@ def test_a_claim_is_stale_when_a_source_that_it_covers_has_changed(committed, re
     assert of.why == f"1 file of firmware, hal changed since, in {int(committed)} commit{'' if committed else 's'}"
 
 
+@pytest.mark.parametrize(("name", "text"), [
+    ("law.c", 'int law = 1; // as before\n/* "a" */\n\n    const char *url = "http://a"; /* b\n */\n'),
+    ("README.md", "other\n"),
+])
+def test_comments_of_c_and_documents_leave_a_claim_good(name, text, repository):
+    source = repository / "firmware" / "law.c"
+    source.write_text('int law = 1;\nconst char *url = "http://a"; /* c */\n', encoding="utf-8")
+    commit(repository, "law")
+    write_summary(repository)
+    (repository / "firmware" / name).write_text(text, encoding="utf-8")
+    commit(repository, "words")
+    assert verdict(repository).state == GOOD
+
+
+@pytest.mark.parametrize("text", [
+    "int law = 2;\n#define A\nint b;\n", 'int law = 1; // "\n#define A int b;\n', "int law = 1;\n#define A\n", None,
+])
+def test_another_line_of_code_and_a_file_that_has_gone_make_a_claim_stale(text, repository):
+    source = repository / "firmware" / "law.c"
+    source.write_text("int law = 1;\n#define A\nint b;\n", encoding="utf-8")
+    commit(repository, "law")
+    write_summary(repository)
+    source.unlink()
+    if text is not None:
+        source.write_text(text, encoding="utf-8")
+    assert verdict(repository).why == "1 file of firmware, hal changed since, in 0 commits"
+
+
+def test_a_new_file_makes_a_claim_stale(repository):
+    (repository / "hal").mkdir()
+    (repository / "hal" / "port.h").write_text("/* nothing else */\n", encoding="utf-8")
+    commit(repository, "port")
+    assert verdict(repository).why == "1 file of firmware, hal changed since, in 1 commit"
+
+
 @pytest.mark.parametrize(("violations", "number"), [
     ({"a": {"count": 2}, "b": {"count": 1}}, 3), (["a", "b"], 2), (1, 1),
 ])

@@ -2,7 +2,7 @@
 
 A claim of tests/evidence.toml is a sentence, its assumptions, a command and the committed summary that the command has
 left. It is red when the summary is missing, when it has failures, or when sources that the claim covers have changed
-since the commit of the summary. Nothing here measures: `--run` runs the commands of the red claims, each of which goes
+since the commit of the summary; comments of C and documents are no such change. Nothing here measures: `--run` runs the commands of the red claims, each of which goes
 on where it was interrupted, and commits nothing.
 
     [[claim]]
@@ -23,6 +23,7 @@ on where it was interrupted, and commits nothing.
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
@@ -35,12 +36,14 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from salient import c_text
 from salient.errors import RunFailed, UsageError, reason
 from salient.pages import write_page
 from salient.paths import OUT, ROOT, make_folder
 
 CLAIMS = Path("tests") / "evidence.toml"
 """In the repository."""
+C_SOURCES = (".c", ".h", ".cpp", ".def")
 GOOD = "good"
 MISSING, FAILING, STALE = "missing", "failing", "stale"
 RED = (MISSING, FAILING, STALE)
@@ -191,12 +194,38 @@ def _date(commit: str, root: Path) -> str:
 
 def _changes(claim: Claim, commit: str, root: Path) -> str:
     """Changes of the covered sources since a commit, in words; empty without any."""
-    changed = (_git(root, "diff", "--name-only", commit, "--", *claim.covers) or "").splitlines()
+    named = (_git(root, "diff", "--name-only", "--no-renames", commit, "--", *claim.covers) or "").splitlines()
+    changed = [name for name, then in _texts(commit, [name for name in named if not name.endswith(".md")], root).items()
+               if _significant(name, then) != _significant(name, _now(root / name))]
     if not changed:
         return ""
-    commits = _git(root, "rev-list", "--count", f"{commit}..HEAD", "--", *claim.covers) or "0"
+    commits = _git(root, "rev-list", "--count", f"{commit}..HEAD", "--", *changed) or "0"
     return (f"{len(changed):,} file{'s' if len(changed) > 1 else ''} of {', '.join(claim.covers)} changed since, in "
             f"{commits} commit{'' if commits == '1' else 's'}")
+
+
+def _significant(name: str, text: bytes | None) -> bytes | str | None:
+    """The part of a file that a measurement depends on: code of C and C++ without its comments; None: there is no
+    file."""
+    return c_text.code(text.decode()) if text is not None and name.endswith(C_SOURCES) else text
+
+
+def _now(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
+def _texts(commit: str, names: Sequence[str], root: Path) -> dict[str, bytes | None]:
+    """Files at a commit; None for one that it does not have."""
+    asked = "".join(f"{commit}:{name}\n" for name in names).encode()
+    answer = io.BytesIO(subprocess.run(["git", "-C", str(root), "cat-file", "--batch"], input=asked,
+                                       capture_output=True, check=True).stdout)
+    texts: dict[str, bytes | None] = {}
+    for name in names:
+        *_, kind, size = answer.readline().split()  # of an object there are name, type and size
+        texts[name] = answer.read(int(size)) if kind == b"blob" else None
+        if kind == b"blob":
+            answer.readline()
+    return texts
 
 
 def run(out: Path, only: Sequence[str], *, rerun: bool) -> int:

@@ -17,6 +17,7 @@ import tokenize
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from salient import c_text
 from salient.exceptions import unexplained
 from salient.paths import ROOT
 
@@ -32,8 +33,6 @@ _COMMENT = re.compile(r"""(?:/\*+|//|(?<!['"])#(?!["'])|\"\"\")\s?(?P<words>[A-Z
 _CELL = re.compile(r"^(?:\| |[-*] |\d+\. )(?P<words>\w+(?: \w+)?)")
 _NONE = re.compile(r"(?<!there )\b(?:is|are) none\b")
 _THAT_OF = re.compile(r"\b(?:that|those)\s+of\b", re.IGNORECASE)
-_C_TOKEN = re.compile(r"""R"\([\s\S]*?\)"|"(?:\\.|[^"\\\n])*"|'(?:\\[^'\n]*|[^'\\\n])'"""
-                      r"""|(?P<comment>/\*[\s\S]*?\*/|//[^\n]*(?:\n[ \t]*//[^\n]*)*)""")
 _C_MARGIN = re.compile(r"^[ \t]*(?://+|\*(?!/))", re.MULTILINE)
 _OPENINGS = ("of", "what")
 
@@ -51,7 +50,7 @@ def _that_of(text: str, first: int = 1) -> Iterator[tuple[int, str]]:
 def _c_comments(text: str) -> Iterator[tuple[int, str]]:
     """Number of the first line, and text, of each comment without its margin; comments with // on successive lines are
     one."""
-    for token in _C_TOKEN.finditer(text):
+    for token in c_text.TOKEN.finditer(text):
         if token["comment"]:
             yield 1 + text.count("\n", 0, token.start()), _C_MARGIN.sub("", token["comment"])
 

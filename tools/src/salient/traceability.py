@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from salient import c_text
 from salient.exceptions import read_exceptions
 from salient.experiments import mutants, planted
 from salient.paths import ROOT
@@ -46,8 +47,6 @@ SAFETY_PART = (
 """Patterns of the test files, each of whose tests has a requirement."""
 
 _MARK = re.compile(r"\[(SR-\d\d)\]")
-_COMMENT = re.compile(r"""R"\([\s\S]*?\)"|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])'"""
-                      r"""|(?P<comment>/\*[\s\S]*?\*/|//[^\n]*(?:\n[ \t]*//[^\n]*)*)""")
 _C_FUNCTION = re.compile(r"\s*[A-Za-z_][^;{}=#/]*?\b(?P<name>\w+)\([^;{}]*\)\s*\{")
 _C_FUNCTIONS = re.compile(r"^[A-Za-z_][^;{}=#/()]*?\b(?P<name>\w+)\([^;{}]*\)\s*\{.*?^\}", re.MULTILINE | re.DOTALL)
 _DEF_ROW = re.compile(r"\s*[A-Z_]+\((?P<name>\w+),")
@@ -126,7 +125,7 @@ def in_c(file: str, text: str) -> Iterator[Marked]:
     """Marks of a C or .def file: of functions, of rows, and of the file, whose name is "". One that belongs to nothing
     has the name "?"."""
     row = _DEF_ROW if file.endswith(".def") else _C_FUNCTION
-    for comment in (found for found in _COMMENT.finditer(text) if found["comment"]):
+    for comment in (found for found in c_text.TOKEN.finditer(text) if found["comment"]):
         names = _marks(comment["comment"])
         if names:
             after = row.match(text, comment.end())
@@ -161,7 +160,7 @@ def _comments(text: str, *, python: bool) -> tuple[str, list[re.Match[str]]]:
         head = re.match(r'"""[\s\S]*?"""|(?:#[^\n]*\n)*', text)
         at = head.end() if head else 0
         return text[:at], [found for found in _PYTHON_COMMENT.finditer(text) if found.start() >= at]
-    comments = [found for found in _COMMENT.finditer(text) if found["comment"]]
+    comments = [found for found in c_text.TOKEN.finditer(text) if found["comment"]]
     has_head = bool(comments) and comments[0].start() == 0
     return (comments[0].group() if has_head else ""), comments[has_head:]
 
