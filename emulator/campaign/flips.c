@@ -45,7 +45,7 @@ enum {
 typedef struct {
     uint64_t hash, end_ns;
     unsigned signal, state, cause, violations, sets;
-    uint64_t fault_us, run_us; /* begin of the last fault, and of the last run; 0: since before the flip */
+    uint64_t fault_us, run_us; /* start of the last fault, and of the last run; 0: since before the flip */
     bool reset, reversed;
     checkers_violation_t violation[VIOLATIONS_MAX]; /* rules are strings of the program, the same in every child */
 } result_t;

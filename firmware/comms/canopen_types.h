@@ -51,7 +51,7 @@ typedef struct {
     bool toggle;
     uint8_t buffer[4];                 /* of a number */
     uint32_t size;                     /* of the object, bytes; download: announced, 0: not */
-    uint32_t offset;                   /* bytes transferred; block upload: at the begin of the block */
+    uint32_t offset;                   /* bytes transferred; block upload: at the start of the block */
     uint8_t block_size, sequence;      /* segments of a block, and the last one */
     bool check;                        /* with CRC */
     uint16_t crc;                      /* of a download */

@@ -5,7 +5,7 @@
  * Frames XCP_COMMAND and XCP_RESPONSE (drive.dbc) of at most 8 bytes, low byte first, addresses of bytes. An address is
  * of one of four areas:
  *
- *   0x00000000  the drive's memory, read only, counted from its begin: the same on any board
+ *   0x00000000  the drive's memory, read only, counted from its start: the same on any board
  *   0x10000000  parameters, 4 bytes each, in the order of parameters.def: read, and written as below
  *   0x20000000  set-up of the triggered buffer, words of xcp_scope_word_t: read and written; a write of the word
  *               XCP_SCOPE_COMMAND arms, triggers or stops it (interrupts/sampler.h)

@@ -64,7 +64,7 @@ uint8_t xcp_text_length(const xcp_t *xcp, unsigned text) {
     return length;
 }
 
-/* Byte of an area, from its begin on; within() holds. */
+/* Byte of an area, from its start on; within() holds. */
 static uint8_t byte_at(const xcp_t *xcp, const parameters_t *parameters, uint32_t area, uint32_t offset) {
     switch (area) {
     case XCP_AREA_PARAMETERS:

@@ -177,7 +177,7 @@ static int32_t smoothed_q24(const conduction_state_t *state, uint32_t phases, co
     const int32_t torque = fixed_abs(sample->torque_q24);
     const uint64_t strokes_q31 = (uint64_t)sample->angle_step * phases >> 1;
     const int32_t part_q31 = strokes_q31 > INT32_MAX ? INT32_MAX : (int32_t)strokes_q31;
-    if (state->partial_q15 == 0) { /* as at the begin */
+    if (state->partial_q15 == 0) { /* as at the start */
         return torque;
     }
     return state->torque_q24 + 2 * fixed_multiply_high(torque - state->torque_q24, part_q31);

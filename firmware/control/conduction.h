@@ -22,7 +22,7 @@
  *   on = on_sharing + level * (-lead_max - on_sharing),   end = end_sharing + level * (end_max - end_sharing)
  *   level = (T - T_smooth) / (T_mean - T_smooth) + trim,   clamped to 0..1
  *
- * with angles past the begin of that half, and T the mean of the reference over about a stroke. T_smooth is the largest
+ * with angles past the start of that half, and T the mean of the reference over about a stroke. T_smooth is the largest
  * torque without lead and without ripple, T_mean the largest mean torque. The trim is the integral over the angle of
  * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque equal
  * the reference. It begins where a shortfall has lasted, above base speed at once: the way by the advance is longer and
@@ -45,7 +45,7 @@
  * The torque is limited to T_mean. Braking torque, whose energy goes into the DC link, is reduced linearly where the
  * voltage approaches the over-voltage threshold: a chopper that cannot take more, or none, does not end in a fault. The
  * range has room for the fields of the phases, which return to the link as the torque is taken away
- * (tools/src/salient/machine/fold_back.py). The integral of the voltage's excess over the begin of that range, or over
+ * (tools/src/salient/machine/fold_back.py). The integral of the voltage's excess over the start of that range, or over
  * the chopper's where that is higher, reduces it, too, until the voltage stays there.
  *
  * Of the room k, 0..1, that both leave for the braking torque, from base speed on a link takes less from longer pulses:
@@ -133,11 +133,11 @@ typedef struct {
 
 /* Pulse for a part of the largest mean torque. */
 typedef struct {
-    uint32_t on, end;   /* past the begin of the half, 2^-32 electrical rev */
+    uint32_t on, end;   /* past the start of the half, 2^-32 electrical rev */
     int32_t ripple_q24; /* to add to the torque reference, N m, Q7.24 */
 } conduction_partial_pulse_t;
 
-/* Window of torque sharing, past the begin of the half, 2^-32 electrical rev. */
+/* Window of torque sharing, past the start of the half, 2^-32 electrical rev. */
 typedef struct {
     uint32_t on, off;
 } conduction_sharing_t;

@@ -15,7 +15,7 @@
 #define FORGET_BITS 11
 #define SAMPLES_MIN 5120u
 #define SAMPLES_EACH 256u
-/* Samples of one conduction: the begin of a longer one is forgotten (e^-2) before its end, and the courses of the rest
+/* Samples of one conduction: the start of a longer one is forgotten (e^-2) before its end, and the courses of the rest
  * are alike. */
 #define CONDUCTION_MAX (2u << FORGET_BITS)
 

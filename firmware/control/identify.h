@@ -27,7 +27,7 @@ typedef struct {
     uint8_t number;     /* another one begins the experiment */
     uint16_t level_q12; /* current, part of the limit, 0..4095 */
     uint16_t time_ms;   /* pulse: longest wait for the window; freewheel: its length; else none */
-    uint16_t angle_q16; /* pulse: begin of the window; damped: place of rest; 2^-16 rev of the encoder */
+    uint16_t angle_q16; /* pulse: start of the window; damped: place of rest; 2^-16 rev of the encoder */
     uint16_t width_q16; /* pulse: of the window, 0: at once */
 } identify_command_t;
 
@@ -63,7 +63,7 @@ typedef struct {
 typedef struct {
     const int32_t *current_q9; /* of each phase, A, Q7.9, 0..65535 */
     int32_t dc_link_q6;        /* V, Q9.6, 0..65535 */
-    uint32_t angle;            /* begin of the encoder's count, 2^-32 rev */
+    uint32_t angle;            /* start of the encoder's count, 2^-32 rev */
 } identify_sample_t;
 
 /* State of the experiments. */
@@ -77,7 +77,7 @@ typedef struct {
     uint8_t action, acted;      /* identify_action_t, of the period after the last sample, and before it */
     uint8_t limit;              /* identify_limit_t that has ended the experiments */
     uint32_t periods;           /* since the state */
-    uint32_t run_periods;       /* since the begin of the run */
+    uint32_t run_periods;       /* since the start of the run */
     uint32_t recorded_periods;  /* since the last record, and its values: */
     int32_t recorded_q9;
     uint8_t recorded_state, recorded_action;
@@ -100,7 +100,7 @@ typedef struct {
 /* Longest time in which a winding carries the limit, or less current for as much copper loss: 1 s. */
 #define IDENTIFY_ENERGY_MS 1000u
 #define IDENTIFY_TIME_MS 120000u
-/* Revolutions, from the begin on. */
+/* Revolutions, from the start on. */
 #define IDENTIFY_TRAVEL_REV 256
 /* Longest time at full voltage. */
 #define IDENTIFY_CHARGE_MS 50u

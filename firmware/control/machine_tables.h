@@ -64,8 +64,8 @@ typedef struct {
 #define MACHINE_PULSE_POINTS 17
 
 typedef struct {
-    uint16_t lead;          /* turn-on before the begin of the half of the wanted torque, 2^-16 electrical rev */
-    uint16_t end;           /* turn-off past the begin of that half, 2^-16 electrical rev, 0..2^15 */
+    uint16_t lead;          /* turn-on before the start of the half of the wanted torque, 2^-16 electrical rev */
+    uint16_t end;           /* turn-off past the start of that half, 2^-16 electrical rev, 0..2^15 */
     uint16_t smooth_torque; /* largest torque without lead and without ripple, N m, Q7.8 */
     uint16_t mean_torque;   /* largest mean torque, N m, Q7.8 */
     uint16_t peak_torque;   /* largest instantaneous sum of all phases with that pulse, N m, Q7.8 */
@@ -76,7 +76,7 @@ typedef struct {
 #define MACHINE_RIPPLE_OFFSET 32
 
 typedef struct {
-    int8_t on;   /* turn-on past the begin of the half of the wanted torque, 2^-8 electrical rev; negative: before */
+    int8_t on;   /* turn-on past the start of the half of the wanted torque, 2^-8 electrical rev; negative: before */
     uint8_t end; /* turn-off past it, 2^-8 electrical rev, 0..128 */
     /* By which the torque reference is raised, part of the largest mean torque, Q1.7, and MACHINE_RIPPLE_OFFSET. */
     uint8_t ripple;
@@ -88,7 +88,7 @@ typedef struct {
 #define MACHINE_SHARING_PARTS 4
 
 typedef struct {
-    int16_t on;  /* turn-on past the begin of the half of the wanted torque, 2^-16 electrical rev; negative: before */
+    int16_t on;  /* turn-on past the start of the half of the wanted torque, 2^-16 electrical rev; negative: before */
     int16_t off; /* turn-off past it, 2^-16 electrical rev; neighbours in the tables differ by less than a quarter */
 } machine_sharing_window_t;
 

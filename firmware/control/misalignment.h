@@ -81,7 +81,7 @@ typedef struct {
     int64_t last_sum_q24;                /* disturbance_sum_q24 at the last update of the phase */
     int64_t offset_q40;                  /* delta_j in 0.02 rad, within +-3.5 (4 degrees) */
     int64_t common_sum_q40;              /* of misalignment_t, at the last update of the phase */
-    int64_t before_last_q40, before_q40; /* delta_j at the begin of the last stroke, and of this one */
+    int64_t before_last_q40, before_q40; /* delta_j at the start of the last stroke, and of this one */
     int32_t offset;                      /* delta_j, 2^-32 electrical rev, to subtract from the phase's angle */
 } misalignment_phase_t;
 

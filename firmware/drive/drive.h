@@ -70,7 +70,7 @@ typedef struct {
     bool ramping;          /* the torque ramps to zero, without commands; the others of a ramp are for this */
     bool ramp_of_speed;    /* the last command was one of speed */
     int16_t left_q14;      /* torque that the load left, of the largest one, when a position was last held */
-    int32_t ramp_from_q24; /* torque reference at its begin, N m, Q7.24 */
+    int32_t ramp_from_q24; /* torque reference at its start, N m, Q7.24 */
     uint32_t ramp_us;      /* time of the last step */
     /* Written by the context of its event, and by the background while it has none. Ahead of the members below,
      * although it is large: the control interrupt reads its first member within the offset of a load. */

@@ -50,7 +50,7 @@ typedef struct {
     uint32_t code_passes;                  /* complete ones */
     uint32_t stack_word;                   /* of the present pass over the stack */
     uint32_t stack_unused;                 /* words, by the last complete pass */
-    uint32_t clock_us, clock_reference_us; /* begin of the present interval */
+    uint32_t clock_us, clock_reference_us; /* start of the present interval */
 } self_test_t;
 
 /* Checks the code as a whole. [background, at the start] */

@@ -27,7 +27,7 @@ static int32_t limited_pi_q24(const control_parameters_t *parameters, deferred_t
     return limited_q24;
 }
 
-/* With fast counts, at the begin of a run and with a position loop the course is the angle itself. */
+/* With fast counts, at the start of a run and with a position loop the course is the angle itself. */
 static int32_t course_q22(const control_parameters_t *parameters, deferred_t *deferred, const deferred_input_t *input) {
     if (!deferred->run || !deferred->slow_counts.slow || deferred->follows_position) {
         count_course_begin(&deferred->count_course, input->angle);

@@ -35,7 +35,7 @@ static inline uint32_t unmasked_read_begin(const deferred_request_t *request) {
     return periods;
 }
 
-/* True when no interrupt came since the begin. */
+/* True when no interrupt came since the start. */
 static inline bool unmasked_read_ended(const deferred_request_t *request, uint32_t periods) {
     __atomic_signal_fence(__ATOMIC_ACQUIRE);
     return unmasked_read_periods(request) == periods;

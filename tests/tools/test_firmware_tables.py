@@ -116,7 +116,7 @@ def test_rows_are_densest_where_the_torque_curvature_is_largest():
 
 
 def rows_inside_bins(tables):
-    """Rows that begin within each angle bin, not counting one at its begin."""
+    """Rows that begin within each angle bin, not counting one at its start."""
     inside = tables.row_start[tables.row_start % (ROW_UNITS // ANGLE_BINS) != 0]
     return np.bincount(inside * ANGLE_BINS // ROW_UNITS, minlength=ANGLE_BINS)
 

@@ -113,7 +113,7 @@ def test_a_pulse_shows_its_inductance():
     ([Pulse(0, RISING, True)] * 4 + [Pulse(1, RISING, True)] * 3, 0.0, "phase b: 3 pulses"),
     ([Pulse(phase, RISING, True) for phase in (0, 1, 2)] * 9, 1.1, "phase a: 0 pulses"),  # all of it within the noise
     ([Pulse(phase, log_of([0.0] * 6), True) for phase in (0, 1, 2)] * 9, 0.0, "phase a: 0 pulses"),
-    ([Pulse(phase, RISING[1:], True) for phase in (0, 1, 2)] * 9, 0.0, "phase a: 0 pulses"),  # without its begin
+    ([Pulse(phase, RISING[1:], True) for phase in (0, 1, 2)] * 9, 0.0, "phase a: 0 pulses"),  # without its start
     ([Pulse(phase, RISING[:3], True) for phase in (0, 1, 2)] * 9, 0.0, "phase a: 0 pulses"),  # one sample
 ])
 def test_pulses_that_do_not_suffice_are_refused_by_phase(pulses, noise_A, reason):

@@ -36,6 +36,9 @@ def breaches(folder: Path, name: str, text: str) -> list[str]:
     ("a.c", "/* Offset of the drive. */ /* Often. Whatever. */\n", []),
     ("a.md", "| of the drive | x |\n\n- What it is\n", ["begins with 'of the'", "begins with 'What it'"]),
     ("a.md", "The speed is that of the rotor, not those\nof others.\n", ["'that of'", "'those of'"]),
+    ("a.c", "/* Until the\n * begin of it, and begin of a run */ // they begin; the beginning, from begin to end\n",
+     ["'the begin'", "'begin of'"]),
+    ("a.md", "Its begin\nand the start.\n", ["'Its begin'"]),
     ("a.md", f"Short. {LONG}\n", ["31 words: word word word word word word ..."]),
     ("a.md", f"```\n{LONG}\n```\n", []),
     ("a.md", f"- {' '.join(['word'] * 20)}\n- {' '.join(['word'] * 20)}\n", []),
@@ -47,7 +50,7 @@ def test_a_rule_finds_what_it_forbids(tmp_path: Path, name: str, text: str, foun
 def test_a_generated_page_may_have_long_sentences_but_says_the_noun(tmp_path: Path) -> None:
     page = tmp_path / "docs" / "reference"
     page.mkdir(parents=True)
-    (page / "a.md").write_text(f"{LONG}\n\n| Speed | that of the rotor |\n", encoding="utf-8")
+    (page / "a.md").write_text(f"{LONG} The begin.\n\n| Speed | that of the rotor |\n", encoding="utf-8")
     assert [(number, breach) for _, number, breach in language.breaches(tmp_path)] == [
         (3, "'that of'")]
 

@@ -18,7 +18,7 @@ typedef struct {
     unsigned samples;    /* 0: begins with the next one */
     uint64_t begin_ns;
     double begin_counts; /* of the encoder, continued over revolutions */
-    double speed_rad_s;  /* at the begin */
+    double speed_rad_s;  /* at the start */
     double error_counts; /* sum, positive: ahead in the direction of counting */
 } state_t;
 

@@ -38,7 +38,7 @@ typedef struct {
     position_homing_t homing;   /* of POSITION_ORDER_HOME */
     uint32_t sequence;          /* changes with each set point: two equal cyclic targets are two */
     bool bounded;               /* by lowest and highest */
-    bool acknowledges;          /* of POSITION_ORDER_HALT: each new sequence does, not its begin alone */
+    bool acknowledges;          /* of POSITION_ORDER_HALT: each new sequence does, not its start alone */
     int64_t target;             /* 2^-32 rev; of POSITION_ORDER_HOME: what the place found is called */
     int32_t speed_q22;          /* of the profile, rad/s times the unit of the machine's speeds, Q9.22, >= 0 */
     int32_t acceleration_rpm_s; /* r/min/s, >= 0 */

@@ -91,7 +91,7 @@ typedef struct {
     int64_t counted;        /* 2^-32 rev since the start, and the angle then */
     int64_t zero;           /* counted at position 0 */
     profile_t profile;
-    uint32_t phase; /* periods since the begin of the tick */
+    uint32_t phase; /* periods since the start of the tick */
     int64_t target; /* of the profile, 2^-48 rev */
     bool stops;     /* target is where a stop ends */
     bool chases;    /* target is where cyclic targets, as they move on, would stop */

@@ -178,7 +178,7 @@ TEST_F(CanopenPdo, the_controlword_of_a_frame_finds_its_mode_and_reference) {
     EXPECT_EQ(sent().front(), (sent_t{0x80 + NODE, {0x10, 0x82, 0, 0, 0, 0, 0, 0}})) << "short";
     EXPECT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
     receive(0x400 + NODE, {0, 0, 9, 1, 0, 0, 0, 0});
-    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "long: its begin counts";
+    EXPECT_EQ(canopen.drive.state, CANOPEN_SWITCH_ON_DISABLED) << "long: its start counts";
 }
 
 TEST_F(CanopenPdo, a_stop_is_taken_beside_a_value_that_is_refused) {

@@ -147,7 +147,7 @@ TEST_F(FluxAngle, is_unknown_while_a_conduction_lasts_longer_than_it_is_remember
 }
 
 TEST_F(FluxAngle, is_unknown_from_a_conduction_that_has_become_too_long_until_a_whole_shorter_one_has_ended) {
-    const auto conduct = [&](double speed_rpm, double seconds) { // from the begin of a conduction
+    const auto conduct = [&](double speed_rpm, double seconds) { // from the start of a conduction
         add({});
         rpm = speed_rpm;
         run(seconds);

@@ -119,7 +119,7 @@ class Sampler : public testing::Test {
     sampler_t sampler{};
 };
 
-// A course of random values around the level, recorded from its begin to the end of the buffer.
+// A course of random values around the level, recorded from its start to the end of the buffer.
 class Course {
   public:
     explicit Course(unsigned seed) : random_(seed), part_(any_part(random_)) {

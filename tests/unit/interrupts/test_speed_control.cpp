@@ -102,7 +102,7 @@ TEST_F(SpeedControl, the_course_of_slow_counts_begins_at_the_angle_and_fast_coun
         EXPECT_EQ(torque_q24(true, false, error_q22), speed_smc_reaching_torque_q24(&deferred.speed_smc, error_q22));
         EXPECT_EQ(deferred.count_course.angle_q64, uint64_t(ANGLE) << 32);
     }
-    EXPECT_EQ(torque_q24(false, true, 0), 0) << "the begin of a run";
+    EXPECT_EQ(torque_q24(false, true, 0), 0) << "the start of a run";
     EXPECT_EQ(deferred.count_course.angle_q64, uint64_t(ANGLE) << 32);
     EXPECT_GT(torque_q24(true, true, 0), 0) << "a course that is ahead";
 }

@@ -336,7 +336,7 @@ TEST(UsableTables, those_of_the_program_are_and_none_with_a_value_that_leads_out
         {"wrong reciprocal", [](auto &t) { t.row[0].reciprocal++; }},
         {"row of the last bin", [](auto &t) { t.angle_bin_row[MACHINE_ANGLE_BINS - 1] = MACHINE_ROWS - 1; }},
         {"row far outside", [](auto &t) { t.angle_bin_row[0] = 255; }},
-        {"row after the begin of its bin", [](auto &t) { t.angle_bin_row[0] = 1; }},
+        {"row after the start of its bin", [](auto &t) { t.angle_bin_row[0] = 1; }},
         {"row that ends before its bin", [](auto &t) { t.angle_bin_row[MACHINE_ANGLE_BINS - 1] = 0; }},
         {"default above its limit",
          [](auto &t) {

@@ -34,7 +34,7 @@ def layout_file(build: str = "host") -> Path:
 @dataclass(frozen=True)
 class Variable:
     """A number in the drive's memory. path: as of Layout.bits, with the indices of arrays; address: of its first byte,
-    from the begin of the drive; names: of an enumeration, by value."""
+    from the start of the drive; names: of an enumeration, by value."""
 
     path: str
     address: int

@@ -2,8 +2,8 @@
 
 A claim of tests/evidence.toml is a sentence, its assumptions, a command and the committed summary that the command has
 left. It is red when the summary is missing, when it has failures, or when sources that the claim covers have changed
-since the commit of the summary; comments of C and documents are no such change. Nothing here measures: `--run` runs the commands of the red claims, each of which goes
-on where it was interrupted, and commits nothing.
+since the commit of the summary; comments of C and documents are no such change. Nothing here measures: `--run` runs
+the commands of the red claims, each of which goes on where it was interrupted, and commits nothing.
 
     [[claim]]
     name = "worlds"

@@ -5,6 +5,7 @@ exceptions by name, each with its reason, are in tools/spelling/language.toml.
 - "none" follows "is" and "are" only after "there".
 - "that of" and "those of" are not written in comments, docstrings and documents, nor across the end of a line: the noun
   is said. The pages in docs/reference hold the rows of DBCs, parameters and help texts to it.
+- "begin" is a verb, the noun is "start" or "beginning"; in the same texts, the pages in docs/reference apart.
 - A sentence of a document has at most 30 words.
 """
 
@@ -33,6 +34,7 @@ _COMMENT = re.compile(r"""(?:/\*+|//|(?<!['"])#(?!["'])|\"\"\")\s?(?P<words>[A-Z
 _CELL = re.compile(r"^(?:\| |[-*] |\d+\. )(?P<words>\w+(?: \w+)?)")
 _NONE = re.compile(r"(?<!there )\b(?:is|are) none\b")
 _THAT_OF = re.compile(r"\b(?:that|those)\s+of\b", re.IGNORECASE)
+_BEGIN = re.compile(r"\b(?:the|its|their)\s+begin\b|\bbegin\s+of\b", re.IGNORECASE)
 _C_MARGIN = re.compile(r"^[ \t]*(?://+|\*(?!/))", re.MULTILINE)
 _OPENINGS = ("of", "what")
 
@@ -41,10 +43,10 @@ def _opens_wrongly(words: str) -> bool:
     return words.lower().split()[0] in _OPENINGS
 
 
-def _that_of(text: str, first: int = 1) -> Iterator[tuple[int, str]]:
-    """first: number of the text's first line."""
+def _found(rule: re.Pattern[str], text: str, first: int = 1) -> Iterator[tuple[int, str]]:
+    """Breaches of a rule, also across the end of a line. first: number of the text's first line."""
     yield from ((first + text.count("\n", 0, found.start()), f"'{' '.join(found[0].split())}'")
-                for found in _THAT_OF.finditer(text))
+                for found in rule.finditer(text))
 
 
 def _c_comments(text: str) -> Iterator[tuple[int, str]]:
@@ -72,7 +74,8 @@ def _python_comments(text: str) -> Iterator[tuple[int, str]]:
 
 def _in_source(text: str, *, python: bool) -> Iterator[tuple[int, str]]:
     for first, comment in (_python_comments if python else _c_comments)(text):
-        yield from _that_of(comment, first)
+        yield from _found(_THAT_OF, comment, first)
+        yield from _found(_BEGIN, comment, first)
     for number, line in enumerate(text.splitlines(), 1):
         yield from ((number, f"begins with '{found['words']}'") for found in _COMMENT.finditer(line)
                     if _opens_wrongly(found["words"]))
@@ -85,8 +88,9 @@ def _in_document(text: str, *, generated: bool) -> Iterator[tuple[int, str]]:
         if found and _opens_wrongly(found["words"]):
             yield number, f"begins with '{found['words']}'"
         yield from ((number, f"'{found[0]}'") for found in _NONE.finditer(line))
-    yield from _that_of(text)
+    yield from _found(_THAT_OF, text)
     if not generated:
+        yield from _found(_BEGIN, text)
         for number, sentence in sentences(text):
             words = len(sentence.split())
             if words > WORDS_MAX:

@@ -46,7 +46,7 @@ class XcpError(RunFailed):
 
 
 class SessionInterface:
-    """A session as pyXCP's interface to the bus. The drive's frames from the begin on are received: `recv`."""
+    """A session as pyXCP's interface to the bus. The drive's frames from the start on are received: `recv`."""
 
     filters: list[dict[str, Any]] | None = None
     state = can.BusState.ACTIVE

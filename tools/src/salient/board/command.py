@@ -150,7 +150,7 @@ def check_image(file: Path) -> None:
 
 
 def _first_bytes(file: Path, content: bytes) -> bytes:
-    """The first two vectors, as far as the file has them at the begin of the flash."""
+    """The first two vectors, as far as the file has them at the start of the flash."""
     if file.suffix == ".bin":
         return content[:8]
     if file.suffix == ".elf":

@@ -59,7 +59,7 @@ from salient.paths import OUT
 SEEDS = 200
 KINDS = ("kill", "silence", "fault", "sto")
 STAGES = {"rest": 0.075, "hold": 4.5, "drift": 1.5, "spin-up": 1.0, "coasting": 0.9}
-"""Stages of an identification; times up to which an instant is drawn after its begin, s."""
+"""Stages of an identification; times up to which an instant is drawn after its start, s."""
 _TOLD = {"rest": ("rest",), "hold": ("hold", "a load"), "drift": ("drift",), "spin-up": ("spin-up",)}
 """Beginnings of the lines by which it tells them. Coasting begins with a rest in the spin-up of this length:"""
 _COASTS_NS = 20_000_000
@@ -107,7 +107,7 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Abort:
-    """An end, and when: offset_s after the begin of a stage."""
+    """An end, and when: offset_s after the start of a stage."""
 
     seed: int
     machine: str
@@ -278,7 +278,7 @@ def run_one(abort: Abort) -> dict[str, Any]:
 
 
 def _judged(abort: Abort, judge: Session, path: Path) -> tuple[list[str], float | None, str, float]:
-    """Another client after the end: what is wrong, time and name of the first cause, and time of its begin."""
+    """Another client after the end: what is wrong, time and name of the first cause, and time of its start."""
     drive, wrong = judge.drive, []
     end_s = judge.time_s
     judge.run_for(_AFTER_S)

@@ -56,7 +56,7 @@ _SIGN = {OFF: -1.0, ZERO: 0.0, ON: 1.0}
 @dataclass(frozen=True)
 class Rows:
     """Samples of pulses. angle_rad: from the rough aligned angle; shaft_rad: of the encoder; flux_Wb: integral of the
-    voltage; charge_As: of the current; time_s: since the begin of the pulse; slope_A_s, supply_V: of the current and of
+    voltage; charge_As: of the current; time_s: since the start of the pulse; slope_A_s, supply_V: of the current and of
     the terminals before the sample; pulse: number."""
 
     pulse: np.ndarray

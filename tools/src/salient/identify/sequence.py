@@ -34,7 +34,7 @@ _QUIET = 0.02
 _HOLD_S, _HOLD_MAX_S, _DAMPED_MAX = 0.15, 3.0, 12
 _FREEWHEEL_MS = 50
 _LATENCY_S, _LEAD_S = 2.5e-3, 1.25e-3
-"""Time to the begin of an experiment; less for a push, whose current has to end in time."""
+"""Time to the start of an experiment; less for a push, whose current has to end in time."""
 _SLOW, _SLOWEST, _FASTEST = 0.2, 0.7, 1.2
 """Parts of the drift speed: below the first the rotor stands, between the others it is kept."""
 _PULSE_S = 0.02
@@ -460,7 +460,7 @@ class Sequence:
         return self._driving
 
     def _windowed(self, phase: int, window: int, bins: int, turn: float, direction: int) -> Experiment:
-        """A pulse at the next passage of a window: its begin in the direction of counting."""
+        """A pulse at the next passage of a window: its start in the direction of counting."""
         found = self.found
         ahead = (direction * ((window + 0.5) / bins - found.electrical(phase, turn))) % 1.0
         centre = turn + direction * ahead / found.rotor_poles

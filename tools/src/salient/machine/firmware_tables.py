@@ -26,7 +26,7 @@ from salient.machine.scaling import Exponents
 ROWS = 33
 ANGLE_BINS = 64
 ROWS_INSIDE_BIN_MAX = 2
-"""Rows that begin within an angle bin, not counting one at its begin."""
+"""Rows that begin within an angle bin, not counting one at its start."""
 NODE_OFFSET = 32768
 CURRENT_A = np.arange(0.0, 81.0, 2.0)
 """Currents of the columns, in the machine's unit of current."""
