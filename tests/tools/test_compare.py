@@ -1,5 +1,6 @@
 """salient compare: its runs, its table, and the comparison with a baseline."""
 
+import base64
 import io
 import json
 import re
@@ -765,7 +766,11 @@ def test_page_is_complete_and_self_contained(tmp_path):
     code, output = compare("ripple", "speeds", "--quick", "--out", tmp_path)
     assert code == 0 and "compare.html" in output
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
-    assert page.count('src="data:image/png;base64,') == 3 == page.count("<img")
+    shown = re.findall('src="data:image/png;base64,([^"]*)"', page)
+    assert len(shown) == 3 == page.count("<img")
+    files = [tmp_path / "plots" / name for name in ("ripple.png", "ripple_2.png", "speeds.png")]
+    assert [base64.b64encode(path.read_bytes()).decode() for path in files] == shown
+    assert sorted(files) == sorted((tmp_path / "plots").iterdir())
     assert not re.search(r"https?://|<script|<link", page)
     for case in (*GROUPS["ripple"].cases(True), *GROUPS["speeds"].cases(True)):
         assert case.condition in page

@@ -88,6 +88,12 @@ def test_paths_that_the_documents_name_exist() -> None:
     assert missing == []
 
 
+def test_every_picture_is_beside_the_command_that_makes_it() -> None:
+    table = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("| picture |")[1].split("\n\n")[0]
+    named = {name for row in table.splitlines()[2:] for name in re.findall(r"`([^`]+)`", row.split(" | ")[0])}
+    assert named == {path.name for path in (ROOT / "docs" / "images").iterdir() if path.suffix in (".png", ".svg")}
+
+
 def test_lists_and_tables_follow_an_empty_line_as_markdown_of_the_site_needs() -> None:
     found = []
     for path in PAGES:

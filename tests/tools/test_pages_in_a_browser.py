@@ -9,7 +9,7 @@ from salient.pages import Plot, write_page
 from salient.paths import ROOT
 
 PLOT = Plot("Largest torque over the speed", "Mean torque at the current limit over the speed, with its bound",
-            (ROOT / "docs" / "images" / "compare.png").read_bytes())
+            (ROOT / "docs" / "images" / "dip.png").read_bytes())
 CONTROLLERS = ["traditional", "paper", "salient"]
 ROWS = [("control interrupts", ["20000", "20000", "20000"]),
         ("firmware/control/observer_bandwidth.c: 319", ["100 %, 100 %", "86 %, 61 %", "100 %, 93 %"])]

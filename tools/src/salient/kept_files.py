@@ -21,7 +21,8 @@ WRITTEN = {"log": ("out",), "tab": ("out",), "identify": ("out",), "scope": ("ou
 """By command: options with a file that is written, be they of READ or not."""
 _RUN = ("results.json", "*/recording.npy", "*/can.blf", "*/can.log")
 FOLDERS = {"run": _RUN, "pil": _RUN, "demo": ("results.json", "report.html"), "sweep": ("sweep.csv", "sweep.png"),
-           "compare": ("compare.json", "compare.html", "summary.toml", "failed/*.toml", "machines/*/*.*"),
+           "compare": ("compare.json", "compare.html", "summary.toml", "failed/*.toml", "machines/*/*.*",
+                       "plots/*.png"),
            "scope": ("scope.csv", "scope.png", "signals.csv"), "board build": ("*.elf", "*.bin", "*.hex")}
 """By command: patterns of what is written to, or at the start removed from, the folder --out."""
 

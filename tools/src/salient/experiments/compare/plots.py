@@ -160,7 +160,7 @@ def _torque_over_speed(content: Content) -> Figure | None:
         axis.set_xlabel("speed / (r/min)")
         axis.set_xlim(0.0, None)
     axes[0].set_ylabel("mean torque / (N m)")
-    _legend(figure, rows)
+    _legend(figure, rows, {"bound": {"color": _TARGET_COLOUR, "linewidth": 1.0}} if bounds else {})
     return figure
 
 
@@ -201,6 +201,7 @@ def _over_angle(content: Content) -> Figure | None:
         return None
     limits = {(row["condition"], row["statistic"]): row for row in _rows(content, "dip")
               if row["figure"] == "speed_dip_rpm"}
+    bounds = {"median": (0, (1, 2)), "worst": (0, (5, 2))}
     figure, axes = _panels(len(conditions), columns=3, height_in=2.9, sharey=True)
     for axis, condition in zip(axes, conditions, strict=True):
         for controller in _controllers_of_runs(runs):
@@ -209,7 +210,7 @@ def _over_angle(content: Content) -> Figure | None:
             if points:
                 axis.plot(*zip(*points, strict=True), _MARKER.get(controller, "o") + "-",
                           color=controller_colour(controller), markersize=3.5, linewidth=1.0)
-        for statistic, dash in (("median", (0, (1, 2))), ("worst", (0, (5, 2)))):
+        for statistic, dash in bounds.items():
             row = limits.get((condition, statistic))
             if row and row["bound"] is not None:
                 axis.axhline(row["bound"], color=_PUBLISHED_COLOUR, linewidth=1.0, linestyle=dash)
@@ -217,7 +218,8 @@ def _over_angle(content: Content) -> Figure | None:
         axis.set_title(condition.replace(", reserve", ",\nreserve"))
         axis.set_xlabel("rotor angle within a stroke / deg")
     axes[0].set_ylabel("speed drop / (r/min)")
-    _legend(figure, _rows(content, "dip"))
+    _legend(figure, _rows(content, "dip"), {f"limit of the {statistic}": {"color": _PUBLISHED_COLOUR, "linestyle": dash}
+                                            for statistic, dash in bounds.items()})
     return figure
 
 
@@ -465,8 +467,10 @@ def _controllers_of_runs(runs: Iterable[Mapping[str, Any]]) -> list[str]:
     return in_order(one["controller"] for one in runs)
 
 
-def _legend(figure: Figure, rows: Sequence[Mapping[str, Any]]) -> None:
+def _legend(figure: Figure, rows: Sequence[Mapping[str, Any]], lines: Mapping[str, Any] = {}) -> None:
+    """Controllers by their markers, then lines of these names and looks."""
     controllers = _controllers(rows)
     handles = [Line2D([], [], color=controller_colour(one), marker=_MARKER.get(one, "o"), linestyle="")
                for one in controllers]
-    figure.legend(handles, controllers, loc="outside upper right", ncols=len(controllers))
+    handles += [Line2D([], [], **look) for look in lines.values()]
+    figure.legend(handles, [*controllers, *lines], loc="outside upper right", ncols=len(handles))
