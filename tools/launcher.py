@@ -186,7 +186,9 @@ def make_environment(install: bool) -> None:
     found = STAMP.read_text().split() if STAMP.exists() and (VENV / "bin/python").exists() else []
     if found == [packages, ours]:
         return
-    pip = [str(VENV / "bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps"]
+    # --no-compile: most modules of the packages are never imported, and those that are get compiled then.
+    pip = [str(VENV / "bin/python"), "-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--no-deps",
+           "--no-compile"]
     steps = [[*pip, "--no-build-isolation", "--editable", str(TOOLS)]]
     if found[:1] != [packages]:
         where = f"{from_root(LOCK)} into {from_root(VENV)} (CAN, plots, tests)"
