@@ -78,6 +78,26 @@ TEST_F(CanopenPosition, a_controller_of_one_quadrant_has_no_such_mode) {
     EXPECT_EQ(write(0x6060, 0, 9), 0u);
 }
 
+TEST_F(CanopenPosition, a_bit_4_that_is_set_while_the_drive_waits_to_be_enabled_is_no_edge) {
+    write(0x6060, 0, 1);
+    operational();
+    write(0x607A, 0, UNITS);
+    control(6);
+    control(7);
+    canopen.measured.state = DRIVE_STATE_RUN; // the run before has not ended
+    control(ENABLE | NEW);
+    cycle(2);
+    ASSERT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
+    control(ENABLE | NEW);
+    follow(3);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+    EXPECT_EQ(status() & ACKNOWLEDGED, 0u);
+    control(ENABLE);
+    control(ENABLE | NEW);
+    follow(3);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_PROFILE);
+}
+
 TEST_F(CanopenPosition, a_set_point_is_taken_by_the_edge_acknowledged_and_reached_in_its_window_time) {
     begin(1);
     write(0x6068, 0, 5);
