@@ -221,6 +221,19 @@ TEST_F(CanopenDrive, a_fault_is_one_emergency_another_in_its_place_is_one_and_so
     EXPECT_EQ(emergencies(FAULT_OVER_VOLTAGE), codes_t{});
 }
 
+TEST_F(CanopenDrive, a_velocity_is_reached_in_the_window_time_of_its_own_run) {
+    write(0x606E, 0, 50);
+    cycle(200);
+    for (unsigned run = 0; run < 2; run++) {
+        enable();
+        EXPECT_EQ(status() & 0x400u, 0u) << run;
+        cycle(60);
+        EXPECT_NE(status() & 0x400u, 0u) << run;
+        control(DISABLE_VOLTAGE);
+        cycle(200);
+    }
+}
+
 TEST_F(CanopenDrive, profile_velocity_follows_its_ramp) {
     enable();
     write(0x6083, 0, 2000);
@@ -442,6 +455,21 @@ TEST_F(CanopenDrive, a_lost_heartbeat_is_a_quick_stop_then_open_switches) {
     cycle(130);
     expect_state(CANOPEN_SWITCH_ON_DISABLED, "at rest");
     EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(CanopenDrive, a_heartbeat_that_stays_away_is_lost_once_and_once_more_after_it_was_heard) {
+    write(0x1016, 1, 0x7F << 16 | 100);
+    operational();
+    for (unsigned loss = 0; loss < 2; loss++) {
+        receive(0x77F, {5});
+        sent();
+        cycle(1000);
+        unsigned emergencies = 0;
+        for (const sent_t &frame : sent()) {
+            emergencies += frame.identifier == 0x80 + NODE;
+        }
+        EXPECT_EQ(emergencies, 1u) << loss;
+    }
 }
 
 TEST_F(CanopenDrive, silence_without_any_supervision_is_a_lost_master) {

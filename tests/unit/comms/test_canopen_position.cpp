@@ -283,7 +283,8 @@ TEST_F(CanopenPosition, homing_begins_by_the_edge_after_a_halt_and_tells_its_end
     write(0x607C, 0, UNITS / 4);
     write(0x609A, 0, 700);
     EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), REACHED) << "not begun";
-    for (bool fails : {false, true, false}) {
+    for (const auto &[homed, fails] :
+         {std::pair(true, false), std::pair(false, true), std::pair(true, true), std::pair(true, false)}) {
         canopen.place.sequence--; // a cycle that the loop has missed
         control(ENABLE | NEW);
         cycle(3);
@@ -298,7 +299,7 @@ TEST_F(CanopenPosition, homing_begins_by_the_edge_after_a_halt_and_tells_its_end
         follow(5);
         EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), 0u) << "under way";
         canopen.place.homing = false;
-        canopen.place.homed = !fails;
+        canopen.place.homed = homed; // also where the way back from its place fails
         canopen.place.homing_failed = fails;
         follow(2);
         EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), REACHED | (fails ? ERROR : ACKNOWLEDGED));

@@ -310,6 +310,18 @@ TEST_F(Identify, the_copper_loss_of_a_second_at_the_limit_is_its_end) {
     EXPECT_NEAR(periods, 1000 * 40, 2);
 }
 
+TEST_F(Identify, the_copper_loss_of_a_current_between_the_steps_of_its_square_is_rounded_to_nearest) {
+    parameters.limit_q9 = 2 * 512;
+    for (const auto &[excess_q9, squares] : {std::pair(127, 4 * 4 / 2), std::pair(128, 5 * 5 / 2)}) {
+        identify_begin(&identify, 0, true);
+        current_q9[1] = 2 * 512 + excess_q9;
+        parameters.limit_q9 = current_q9[1];
+        const identify_sample_t sample = {.current_q9 = current_q9, .dc_link_q6 = 240 * 64, .angle = 0};
+        identify_step(&parameters, &identify, &sample, duty_q15);
+        EXPECT_EQ(identify.energy[1], uint32_t(squares)) << excess_q9;
+    }
+}
+
 TEST_F(Identify, at_a_rate_at_which_the_copper_loss_of_a_second_does_not_fit_it_is_as_much_as_fits) {
     parameters.periods_per_ms = 1000;
     parameters.limit_q9 = current_q9[1] = 66 * 512; // 8.7e9 of 4.3e9
