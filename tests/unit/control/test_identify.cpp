@@ -137,6 +137,18 @@ TEST_F(Identify, the_first_pulse_waits_for_what_one_period_makes_of_the_current)
     EXPECT_LE(peak_A, 30.0);
 }
 
+TEST_F(Identify, how_the_rise_of_one_pulse_grew_holds_back_no_pulse_of_another_number) {
+    saturated_A = 20.0;
+    command(IDENTIFY_KIND_PULSE);
+    run_until_idle();
+    ASSERT_GT(identify.growth_q9, 0);
+    identify.acted = identify.action = IDENTIFY_OFF;
+    command(IDENTIFY_KIND_PULSE);
+    step();
+    EXPECT_EQ(identify.growth_q9, 0);
+    EXPECT_EQ(identify.state, IDENTIFY_CHARGES);
+}
+
 TEST_F(Identify, a_window_is_awaited_in_both_directions_and_over_the_end_of_the_revolution) {
     rise_A = 1.0;
     for (const int direction : {1, -1}) {
