@@ -2133,7 +2133,7 @@ TEST_F(Drive, the_recorder_has_each_event_s_periods_and_no_other_s) {
     EXPECT_EQ(records(SAMPLER_EVENT_CONTROL, 7), 7u);
 }
 
-TEST_F(Drive, a_position_command_during_a_move_keeps_the_torque_that_the_load_left_before_it) {
+TEST_F(Drive, a_position_command_has_the_torque_that_a_load_of_either_sign_leaves_and_in_a_move_what_it_left_before) {
     ASSERT_NO_FATAL_FAILURE(start(DRIVE_CONTROLLER_SALIENT));
     periods(100);
     for (const int32_t moves : {1, -1, 0}) {
@@ -2144,6 +2144,12 @@ TEST_F(Drive, a_position_command_during_a_move_keeps_the_torque_that_the_load_le
         EXPECT_EQ(drive.left_q14 == 1234, moves != 0) << moves;
     }
     EXPECT_NEAR(drive.left_q14, 15.0 / 16.0 * 16384.0, 2.0) << "all but a 16th";
+    for (const int32_t direction : {1, -1}) {
+        drive.control.observer.load_torque_q24 = direction * (drive.control_parameters.conduction.torque_max_q24 / 4);
+        hal.to_drive.push_back(frames::position_command(++counter, COMMAND_OFF, POSITION_ORDER_PROFILE, 1 << 16));
+        drive_background(&drive, &hal);
+        EXPECT_NEAR(drive.left_q14, 11.0 / 16.0 * 16384.0, 2.0) << direction;
+    }
 }
 
 // [SR-46]
@@ -2918,9 +2924,11 @@ TEST_F(Drive, the_background_leaves_what_belongs_to_no_phase_of_the_machine_as_i
 }
 
 #if HAL_PHASES_MAX > 4
-TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
+TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost_or_whose_sensors_have_failed) {
     for (unsigned phase = 0; phase < 6; phase++) {
         drive.flux.phases = drive.degraded.lost = 1u << phase;
+        drive.temperature.failed_sensors[TEMPERATURE_WINDING] = uint8_t(1u << phase);
+        drive.temperature.failed_sensors[TEMPERATURE_INVERTER] = uint8_t(32u >> phase);
         drive_telemetry_t telemetry;
         telemetry_collect(&drive, &hal, 0, &telemetry);
         EXPECT_EQ(telemetry.phase_fault & 63u, 1u << phase);
@@ -2928,6 +2936,10 @@ TEST_F(Drive, telemetry_names_each_of_six_phases_that_fails_or_is_lost) {
         EXPECT_EQ(telemetry.phases_e_f.phase_f, phase == 5);
         EXPECT_EQ(telemetry.phases_e_f.lost_phase_e, phase == 4);
         EXPECT_EQ(telemetry.phases_e_f.lost_phase_f, phase == 5);
+        EXPECT_EQ(telemetry.phases_e_f.winding_sensor_e, phase == 4);
+        EXPECT_EQ(telemetry.phases_e_f.winding_sensor_f, phase == 5);
+        EXPECT_EQ(telemetry.phases_e_f.inverter_sensor_e, phase == 1);
+        EXPECT_EQ(telemetry.phases_e_f.inverter_sensor_f, phase == 0);
     }
 }
 #endif

@@ -125,6 +125,33 @@ TEST_F(CanopenDrive, enabling_needs_operational_and_a_ready_drive) {
     expect_state(CANOPEN_SWITCHED_ON, "not for ever");
 }
 
+TEST_F(CanopenDrive, an_enabling_that_waits_for_a_ready_drive_is_withdrawn_by_the_next_command) {
+    for (const bool withdrawn : {true, false}) {
+        go(CANOPEN_SWITCHED_ON);
+        canopen.measured.state = DRIVE_STATE_RUN;
+        control(ENABLE);
+        if (withdrawn) {
+            control(SWITCH_ON);
+        }
+        cycle(2);
+        expect_state(withdrawn ? CANOPEN_SWITCHED_ON : CANOPEN_OPERATION_ENABLED, "ready");
+        EXPECT_EQ(command.request == COMMAND_RUN, !withdrawn);
+    }
+}
+
+TEST_F(CanopenDrive, the_loss_of_a_master_is_told_until_the_drive_is_enabled_again) {
+    enable();
+    write(0x6007, 0, 2);
+    const canopen_context_t now = context();
+    canopen_drive_lose_master(&canopen, &now, CANOPEN_MASTER_SILENT);
+    cycle(2);
+    EXPECT_EQ(read(0x603F, 0), 0x8130u);
+    enable();
+    cycle();
+    EXPECT_EQ(read(0x603F, 0), 0u);
+    EXPECT_EQ(read(0x1001, 0), 0u);
+}
+
 TEST_F(CanopenDrive, a_fault_is_reported_and_reset_by_the_edge) {
     enable();
     values.status.state = DRIVE_STATE_FAULT;
@@ -153,6 +180,58 @@ TEST_F(CanopenDrive, a_fault_is_reported_and_reset_by_the_edge) {
     EXPECT_EQ(sent().front(), (sent_t{0x80 + NODE, {0, 0, 0, 0, 0, 0, 0, 0}}));
     cycle(10);
     EXPECT_EQ(command.request, COMMAND_OFF) << "the bits of enabling start nothing";
+}
+
+TEST_F(CanopenDrive, the_bit_of_a_reset_that_was_set_before_the_fault_is_no_edge_whatever_follows) {
+    enable();
+    control(RESET | ENABLE);
+    values.status.state = DRIVE_STATE_FAULT;
+    values.status.fault = FAULT_OVER_CURRENT;
+    cycle();
+    for (const unsigned word : {RESET | ENABLE, RESET | SHUTDOWN, RESET}) {
+        control(word);
+        cycle();
+        EXPECT_EQ(command.request, COMMAND_OFF) << word;
+    }
+    control(0);
+    control(RESET);
+    cycle();
+    EXPECT_EQ(command.request, COMMAND_CLEAR_FAULT);
+}
+
+TEST_F(CanopenDrive, a_fault_is_one_emergency_another_in_its_place_is_one_and_so_is_the_same_after_it_was_cleared) {
+    enable();
+    const auto emergencies = [this](fault_t fault) {
+        values.status.state = fault == FAULT_NONE ? DRIVE_STATE_READY : DRIVE_STATE_FAULT;
+        values.status.fault = fault;
+        cycle(5);
+        std::vector<unsigned> codes;
+        for (const sent_t &frame : sent()) {
+            if (frame.identifier == 0x80 + NODE) {
+                codes.push_back(frame.data[0] | unsigned(frame.data[1]) << 8);
+            }
+        }
+        return codes;
+    };
+    using codes_t = std::vector<unsigned>;
+    EXPECT_EQ(emergencies(FAULT_OVER_CURRENT), codes_t{canopen_error_codes[FAULT_OVER_CURRENT]});
+    EXPECT_EQ(emergencies(FAULT_OVER_VOLTAGE), codes_t{canopen_error_codes[FAULT_OVER_VOLTAGE]});
+    EXPECT_EQ(emergencies(FAULT_NONE), codes_t{0});
+    EXPECT_EQ(emergencies(FAULT_OVER_VOLTAGE), codes_t{canopen_error_codes[FAULT_OVER_VOLTAGE]});
+    EXPECT_EQ(emergencies(FAULT_OVER_VOLTAGE), codes_t{});
+}
+
+TEST_F(CanopenDrive, a_velocity_is_reached_in_the_window_time_of_its_own_run) {
+    write(0x606E, 0, 50);
+    cycle(200);
+    for (unsigned run = 0; run < 2; run++) {
+        enable();
+        EXPECT_EQ(status() & 0x400u, 0u) << run;
+        cycle(60);
+        EXPECT_NE(status() & 0x400u, 0u) << run;
+        control(DISABLE_VOLTAGE);
+        cycle(200);
+    }
 }
 
 TEST_F(CanopenDrive, profile_velocity_follows_its_ramp) {
@@ -376,6 +455,21 @@ TEST_F(CanopenDrive, a_lost_heartbeat_is_a_quick_stop_then_open_switches) {
     cycle(130);
     expect_state(CANOPEN_SWITCH_ON_DISABLED, "at rest");
     EXPECT_EQ(command.request, COMMAND_OFF);
+}
+
+TEST_F(CanopenDrive, a_heartbeat_that_stays_away_is_lost_once_and_once_more_after_it_was_heard) {
+    write(0x1016, 1, 0x7F << 16 | 100);
+    operational();
+    for (unsigned loss = 0; loss < 2; loss++) {
+        receive(0x77F, {5});
+        sent();
+        cycle(1000);
+        unsigned emergencies = 0;
+        for (const sent_t &frame : sent()) {
+            emergencies += frame.identifier == 0x80 + NODE;
+        }
+        EXPECT_EQ(emergencies, 1u) << loss;
+    }
 }
 
 TEST_F(CanopenDrive, silence_without_any_supervision_is_a_lost_master) {

@@ -4,6 +4,10 @@
 #include <algorithm>
 #include <random>
 
+extern "C" {
+#include "comms/canopen_send.h"
+}
+
 namespace {
 
 using namespace canopen_bench;
@@ -318,6 +322,43 @@ TEST_F(CanopenPdo, transmission_types_and_timers) {
     EXPECT_EQ(canopen.drive.state, CANOPEN_READY_TO_SWITCH_ON) << "with the SYNC";
 }
 
+TEST_F(CanopenPdo, a_receive_pdo_that_stays_away_is_lost_once_and_once_more_after_it_came) {
+    operational();
+    write(0x1400, 5, 20);
+    for (unsigned loss = 0; loss < 2; loss++) {
+        receive(0x200 + NODE, {0, 0});
+        sent();
+        unsigned emergencies = 0;
+        for (unsigned i = 0; i < 200; i++) {
+            cycle();
+            for (const sent_t &frame : sent()) {
+                emergencies += frame.identifier == 0x80 + NODE;
+            }
+        }
+        EXPECT_EQ(emergencies, 1u) << loss;
+    }
+}
+
+TEST_F(CanopenPdo, each_emergency_is_an_inhibit_time_after_the_one_before) {
+    operational();
+    cycle(500);
+    write(0x1015, 0, 200); // 20 ms
+    sent();
+    for (unsigned i = 0; i < 4; i++) {
+        canopen_emergency(&canopen, 0x1000 + i, FAULT_NONE);
+    }
+    std::vector<unsigned> at;
+    for (unsigned ms = 0; ms < 200; ms++) {
+        cycle();
+        for (const sent_t &frame : sent()) {
+            if (frame.identifier == 0x80 + NODE) {
+                at.push_back(ms);
+            }
+        }
+    }
+    EXPECT_EQ(at, (std::vector<unsigned>{0, 20, 40, 60}));
+}
+
 TEST_F(CanopenPdo, nmt_heartbeat_and_guarding) {
     EXPECT_EQ(canopen.nmt, CANOPEN_NMT_PRE_OPERATIONAL);
     write(0x1017, 0, 10);
@@ -401,6 +442,20 @@ TEST_F(CanopenPdo, lss_selects_and_sets_the_node) {
         response = lss(0x46 + i, i == 4 ? 2 : range[i]);
     }
     EXPECT_EQ(response, bytes_t{});
+}
+
+TEST_F(CanopenPdo, lss_selects_by_four_numbers_that_no_switch_of_all_devices_interrupts) {
+    const uint32_t identity[] = {CANOPEN_VENDOR, CANOPEN_PRODUCT, machine_tables.machine_hash, 1};
+    for (const bool interrupted : {true, false}) {
+        for (unsigned i = 0; i < 4; i++) {
+            if (interrupted && i == 3) {
+                receive(0x7E5, {0x04, 0, 0, 0, 0, 0, 0, 0});
+            }
+            receive(0x7E5, {uint8_t(0x40 + i), uint8_t(identity[i]), uint8_t(identity[i] >> 8),
+                            uint8_t(identity[i] >> 16), uint8_t(identity[i] >> 24), 0, 0, 0});
+        }
+        EXPECT_EQ(sent().empty(), interrupted);
+    }
 }
 
 TEST_F(CanopenPdo, lss_fast_scan_finds_a_device_without_a_node_and_gives_it_one) {

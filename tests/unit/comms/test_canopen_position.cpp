@@ -78,6 +78,26 @@ TEST_F(CanopenPosition, a_controller_of_one_quadrant_has_no_such_mode) {
     EXPECT_EQ(write(0x6060, 0, 9), 0u);
 }
 
+TEST_F(CanopenPosition, a_bit_4_that_is_set_while_the_drive_waits_to_be_enabled_is_no_edge) {
+    write(0x6060, 0, 1);
+    operational();
+    write(0x607A, 0, UNITS);
+    control(6);
+    control(7);
+    canopen.measured.state = DRIVE_STATE_RUN; // the run before has not ended
+    control(ENABLE | NEW);
+    cycle(2);
+    ASSERT_EQ(canopen.drive.state, CANOPEN_OPERATION_ENABLED);
+    control(ENABLE | NEW);
+    follow(3);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_HALT);
+    EXPECT_EQ(status() & ACKNOWLEDGED, 0u);
+    control(ENABLE);
+    control(ENABLE | NEW);
+    follow(3);
+    EXPECT_EQ(command.position.order, POSITION_ORDER_PROFILE);
+}
+
 TEST_F(CanopenPosition, a_set_point_is_taken_by_the_edge_acknowledged_and_reached_in_its_window_time) {
     begin(1);
     write(0x6068, 0, 5);
@@ -263,7 +283,8 @@ TEST_F(CanopenPosition, homing_begins_by_the_edge_after_a_halt_and_tells_its_end
     write(0x607C, 0, UNITS / 4);
     write(0x609A, 0, 700);
     EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), REACHED) << "not begun";
-    for (bool fails : {false, true, false}) {
+    for (const auto &[homed, fails] :
+         {std::pair(true, false), std::pair(false, true), std::pair(true, true), std::pair(true, false)}) {
         canopen.place.sequence--; // a cycle that the loop has missed
         control(ENABLE | NEW);
         cycle(3);
@@ -278,7 +299,7 @@ TEST_F(CanopenPosition, homing_begins_by_the_edge_after_a_halt_and_tells_its_end
         follow(5);
         EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), 0u) << "under way";
         canopen.place.homing = false;
-        canopen.place.homed = !fails;
+        canopen.place.homed = homed; // also where the way back from its place fails
         canopen.place.homing_failed = fails;
         follow(2);
         EXPECT_EQ(status() & (ACKNOWLEDGED | REACHED | ERROR), REACHED | (fails ? ERROR : ACKNOWLEDGED));

@@ -153,6 +153,14 @@ TEST_F(CanopenSdo, a_wrong_toggle_ends_a_transfer) {
     EXPECT_EQ(word(sdo({0x70, 0, 0, 0, 0, 0, 0, 0})), 0x05040001u);
 }
 
+TEST_F(CanopenSdo, an_abort_of_the_client_ends_a_transfer_in_either_direction) {
+    for (const bool uploads : {true, false}) {
+        ASSERT_EQ(sdo(uploads ? head(0x40, 0x1008, 0) : head(0x21, 0x6083, 0, 4))[0], uploads ? 0x41 : 0x60);
+        EXPECT_EQ(sdo(head(0x80, 0, 0, 0x08000000u)), bytes_t{});
+        EXPECT_EQ(code_of(sdo({uint8_t(uploads ? 0x60 : 0x07), 1, 0, 0, 0, 0, 0, 0})), 0x05040001u) << uploads;
+    }
+}
+
 TEST_F(CanopenSdo, a_number_is_written_by_segments_and_only_when_it_is_whole) {
     EXPECT_EQ(download(0x60FF, 0, {0x58, 0x02, 0, 0}), (bytes_t{0x20, 0, 0, 0, 0, 0, 0, 0}));
     EXPECT_EQ(read(0x60FF, 0), 600u);

@@ -115,6 +115,18 @@ TEST_F(XcpProgram, needs_its_own_resource_and_the_commands_in_their_order) {
     EXPECT_EQ(send({0xD1, 0, 0, 0}), failed(XCP_ERROR_SYNTAX));
 }
 
+TEST_F(XcpProgram, needs_its_start_in_each_session) {
+    open_cleared();
+    connect();
+    unlock(XCP_RESOURCE_PROGRAMMING);
+    ASSERT_EQ(set_address(XCP_AREA_TABLES), DONE);
+    for (const bytes_t &command : {clear(), part(0, 6), bytes_t{0xD0, 0}}) {
+        EXPECT_EQ(send(command), failed(XCP_ERROR_SEQUENCE));
+    }
+    EXPECT_EQ(send({0xD2}), STARTED);
+    EXPECT_EQ(settled(clear()), DONE);
+}
+
 TEST_F(XcpProgram, clears_the_whole_area_by_its_address_alone) {
     open_programming();
     constexpr uint32_t BYTES = sizeof(machine_tables_t);

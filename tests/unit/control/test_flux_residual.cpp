@@ -65,7 +65,10 @@ TEST_F(FluxResidual, psi_by_voltage_is_unknown_from_a_lost_trigger_to_the_next_z
             step();
         }
     };
+    input.off[0] = true;
+    step();
     conduct();
+    EXPECT_TRUE(residual.phase[0].known);
     input.late_interrupts++;
     conduct();
     EXPECT_FALSE(residual.phase[0].known);

@@ -137,6 +137,18 @@ TEST_F(Identify, the_first_pulse_waits_for_what_one_period_makes_of_the_current)
     EXPECT_LE(peak_A, 30.0);
 }
 
+TEST_F(Identify, how_the_rise_of_one_pulse_grew_holds_back_no_pulse_of_another_number) {
+    saturated_A = 20.0;
+    command(IDENTIFY_KIND_PULSE);
+    run_until_idle();
+    ASSERT_GT(identify.growth_q9, 0);
+    identify.acted = identify.action = IDENTIFY_OFF;
+    command(IDENTIFY_KIND_PULSE);
+    step();
+    EXPECT_EQ(identify.growth_q9, 0);
+    EXPECT_EQ(identify.state, IDENTIFY_CHARGES);
+}
+
 TEST_F(Identify, a_window_is_awaited_in_both_directions_and_over_the_end_of_the_revolution) {
     rise_A = 1.0;
     for (const int direction : {1, -1}) {
@@ -308,6 +320,18 @@ TEST_F(Identify, the_copper_loss_of_a_second_at_the_limit_is_its_end) {
         periods++;
     }
     EXPECT_NEAR(periods, 1000 * 40, 2);
+}
+
+TEST_F(Identify, the_copper_loss_of_a_current_between_the_steps_of_its_square_is_rounded_to_nearest) {
+    parameters.limit_q9 = 2 * 512;
+    for (const auto &[excess_q9, squares] : {std::pair(127, 4 * 4 / 2), std::pair(128, 5 * 5 / 2)}) {
+        identify_begin(&identify, 0, true);
+        current_q9[1] = 2 * 512 + excess_q9;
+        parameters.limit_q9 = current_q9[1];
+        const identify_sample_t sample = {.current_q9 = current_q9, .dc_link_q6 = 240 * 64, .angle = 0};
+        identify_step(&parameters, &identify, &sample, duty_q15);
+        EXPECT_EQ(identify.energy[1], uint32_t(squares)) << excess_q9;
+    }
 }
 
 TEST_F(Identify, at_a_rate_at_which_the_copper_loss_of_a_second_does_not_fit_it_is_as_much_as_fits) {

@@ -208,6 +208,20 @@ TEST_F(PositionLoop, a_load_leaves_less_for_the_acceleration) {
     }
 }
 
+TEST_F(PositionLoop, the_offset_of_cyclic_targets_acts_while_these_come_and_not_in_the_stop_after_them) {
+    const double here_rev = rotor_rev;
+    for (unsigned cycle = 0; cycle < 25; cycle++) {
+        cyclic(here_rev, 4);
+        command.set_point.torque_offset_q24 = 3 << 24;
+        ticks(4);
+    }
+    EXPECT_FALSE(position.stops);
+    EXPECT_NEAR(out.torque_q24 / 16777216.0, 3.0, 0.01);
+    ticks(40);
+    EXPECT_TRUE(position.stops);
+    EXPECT_NEAR(out.torque_q24 / 16777216.0, 0.0, 0.01);
+}
+
 TEST_F(PositionLoop, a_reference_that_has_left_a_heavier_rotor_behind_goes_on_from_there) {
     for (const bool limited : {false, true}) {
         position = {};
@@ -714,6 +728,22 @@ TEST_F(PositionLoop, a_homing_by_a_stop_counts_its_50_ms_anew_after_one_that_was
     ticks(10);
     EXPECT_TRUE(position.status.homed);
     EXPECT_FALSE(position.status.homing || position.status.homing_failed);
+}
+
+TEST_F(PositionLoop, a_rotor_that_is_held_again_and_again_for_less_than_50_ms_is_at_no_stop) {
+    const double far_rev = lowest_rev;
+    order(POSITION_ORDER_HOME, 0.5, POSITION_HOMING_STOP_BACKWARD);
+    for (unsigned hold = 0; hold < 5; hold++) {
+        lowest_rev = rotor_rev;
+        ticks(30);
+        lowest_rev = far_rev;
+        ticks(10);
+        ASSERT_TRUE(position.status.homing) << hold;
+        ASSERT_FALSE(position.status.homed) << hold;
+    }
+    lowest_rev = rotor_rev;
+    ticks(60);
+    EXPECT_TRUE(position.status.homed);
 }
 
 TEST_F(PositionLoop, a_homing_that_another_order_or_the_end_of_the_run_interrupts_has_failed) {

@@ -103,4 +103,22 @@ TEST_F(Degraded, mean_least_and_limit_are_those_of_all_angles_after_one_step_for
     }
 }
 
+TEST_F(Degraded, a_second_loss_is_found_from_its_own_angles_alone) {
+    ASSERT_TRUE(degraded_accepts(&parameters, &degraded, true, OPEN, 1u));
+    for (uint32_t k = 0; k < DEGRADED_ANGLES; k++) {
+        degraded_step(&parameters, &degraded, &machine_tables);
+    }
+    const degraded_t first = degraded;
+    degraded.lost = 0; // cleared by the drive
+    parameters.current_limit_q9 /= 2;
+    ASSERT_TRUE(degraded_accepts(&parameters, &degraded, true, OPEN, 2u));
+    EXPECT_EQ(degraded_torque_limit_q24(&degraded), INT32_MAX) << "not yet known";
+    for (uint32_t k = 0; k < DEGRADED_ANGLES; k++) {
+        degraded_step(&parameters, &degraded, &machine_tables);
+    }
+    EXPECT_GT(degraded.mean_q24, 0);
+    EXPECT_LT(degraded.mean_q24, first.mean_q24 / 4 * 3);
+    EXPECT_LT(degraded_torque_limit_q24(&degraded), first.most_q24 / 4 * 3);
+}
+
 } // namespace

@@ -100,6 +100,20 @@ TEST_F(PhaseBalance, a_small_ratio_of_all_is_the_encoder_s_after_two_windows) {
     EXPECT_EQ(balance.unbalanced, 0u);
 }
 
+TEST_F(PhaseBalance, what_a_cold_winding_would_explain_in_a_window_excuses_none_of_the_next) {
+    ratio[0] = ratio[1] = ratio[2] = 0.74;
+    for (unsigned phase = 0; phase < 3; phase++) {
+        residual.phase[phase].drop_q29 = TABLE_Q29 / 2; // 0.15 of the flux linkage by a cold winding
+    }
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), 0u);
+    for (unsigned phase = 0; phase < 3; phase++) {
+        residual.phase[phase].drop_q29 = 0;
+    }
+    EXPECT_EQ(window(), 0u);
+    EXPECT_EQ(window(), FAULT_BIT(FAULT_ENCODER_ANGLE));
+}
+
 // [SR-28] [SR-30]
 TEST_F(PhaseBalance, revolutions_beyond_100_ms_show_nothing) {
     ratio[1] = 1.5;

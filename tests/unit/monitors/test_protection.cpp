@@ -163,6 +163,23 @@ TEST_F(Protection, any_number_of_skipped_periods_overflows_nothing) {
     EXPECT_EQ(check(input), FAULT_BIT(FAULT_ENCODER));
 }
 
+// [SR-20] [SR-46]
+TEST_F(Protection, more_than_eight_periods_without_a_deferred_step_count_as_eight) {
+    for (const uint32_t periods : {9u, 1000u, UINT32_MAX}) {
+        protection_deferred_t after[2];
+        for (const bool more : {false, true}) {
+            checks.reset(healthy.encoder_angle);
+            input_t input = healthy;
+            turn(input, 10 << 22);
+            input.periods = more ? periods : PROTECTION_SKIPPED_DEFERRED_MAX;
+            EXPECT_EQ(checks.check_deferred(input), 0u) << periods;
+            after[more] = checks.deferred;
+        }
+        EXPECT_EQ(after[1].speed_lower_bound_q22, after[0].speed_lower_bound_q22) << periods;
+        EXPECT_EQ(after[1].undetected_travel, after[0].undetected_travel) << periods;
+    }
+}
+
 // [SR-30]
 TEST_F(Protection, no_check_fails_in_a_healthy_drive) {
     for (int k = 0; k < 1000; k++) {

@@ -55,6 +55,19 @@ TEST_F(Stall, rotor_at_standstill_is_stalled_after_100_ms_in_both_directions) {
     EXPECT_EQ(time_to_fault_us(), 101000u);
 }
 
+TEST_F(Stall, torque_at_the_limit_of_the_reference_s_own_direction_is_in_vain_and_at_the_other_one_s_is_not) {
+    for (const int direction : {1, -1}) {
+        input.speed_reference_q22 = direction * 60 * RAD_S;
+        input.torque_max_q24 = direction > 0 ? 6 * NM : 19 * NM;
+        input.torque_min_q24 = direction > 0 ? -19 * NM : -6 * NM;
+        input.torque_reference_q24 = direction * 6 * NM;
+        EXPECT_EQ(time_to_fault_us(), 101000u) << direction;
+        input.torque_max_q24 = direction > 0 ? 19 * NM : 6 * NM;
+        input.torque_min_q24 = direction > 0 ? -6 * NM : -19 * NM;
+        EXPECT_EQ(time_to_fault_us(), 0u) << direction;
+    }
+}
+
 TEST_F(Stall, rotor_that_the_load_turns_the_other_way_is_stalled) {
     input.speed_q22 = -20 * RAD_S;
     EXPECT_EQ(time_to_fault_us(), 101000u);

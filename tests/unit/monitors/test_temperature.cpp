@@ -138,6 +138,21 @@ TEST_F(Temperature, a_hot_winding_stays_hot_while_its_sensor_cannot_be_read) {
     EXPECT_NEAR(limit_Nm(), TORQUE_MAX_NM / 2.0, 0.02);
 }
 
+// [SR-17] [SR-18]
+TEST_F(Temperature, a_part_that_heats_while_a_sensor_of_it_cannot_be_read_is_as_hot_as_the_others_tell) {
+    for (const auto &[first, limit_C] :
+         {std::pair(unsigned(HAL_ADC_WINDING), 150.0), std::pair(unsigned(HAL_ADC_INVERTER), 90.0)}) {
+        for (unsigned unread = 0; unread < PHASES; unread++) {
+            hal.code.fill(code_of(25.0));
+            step();
+            hal.code[first + unread] = 0;
+            hal.code[first + (unread + 1) % PHASES] = code_of(limit_C - 10.0);
+            step();
+            EXPECT_NEAR(limit_Nm(), TORQUE_MAX_NM / 2.0, 0.02) << first << " " << unread;
+        }
+    }
+}
+
 // [SR-18]
 TEST_F(Temperature, sensor_that_is_open_at_the_first_reading_has_failed_then_and_those_of_no_phase_do_not_count) {
     hal.code[HAL_ADC_WINDING + 3] = hal.code[HAL_ADC_INVERTER + 3] = 65520;

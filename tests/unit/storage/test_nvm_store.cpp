@@ -309,6 +309,25 @@ TEST_F(NvmStore, failures_that_one_record_has_survived_do_not_count_for_the_next
     }
 }
 
+TEST_F(NvmStore, a_record_that_was_given_up_leaves_the_next_one_all_its_attempts) {
+    const auto save = [this](uint32_t errors) {
+        memory.hal.erase_errors = errors;
+        parameter_store_save(&drive.store);
+        while (drive.store.saving == NVM_STORE_SAVING) {
+            nvm_store_step(&drive.store, &memory.hal, &drive.parameters, 1, true);
+        }
+        return drive.store.saving;
+    };
+    unsigned given_up = 0;
+    for (unsigned saves = 0; saves < 3 * SETS_PER_PAGE; saves++) {
+        if (save(NVM_RING_ATTEMPTS) == NVM_STORE_FAILED) {
+            given_up++;
+            ASSERT_EQ(save(NVM_RING_ATTEMPTS - 1), NVM_STORE_SAVED) << saves;
+        }
+    }
+    EXPECT_GE(given_up, 2u);
+}
+
 TEST_F(NvmStore, a_word_that_the_memory_only_says_to_have_programmed_is_read_back_and_passed_over) {
     write(WRITE_SET);
     for (unsigned word = 0; word < SET_WORDS; word++) {
