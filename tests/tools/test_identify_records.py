@@ -136,7 +136,7 @@ def test_pulses_of_which_a_fourth_cannot_be_left_out_are_refused(monkeypatch):
 
     monkeypatch.setattr(electrical, "_solved", undetermined)
     with pytest.raises(IdentifyError, match="3 of 4 pulses do not determine the machine"):
-        electrical._smoothness(problem, rows)
+        electrical._smoothness(problem, electrical._folds(problem, rows), (1.0,), (1.0,))
 
 
 def sequence_of(turns_rev) -> tuple[Sequence, list[tuple[float, float]]]:

@@ -91,12 +91,13 @@ class FluxBasis:
         return np.asarray(np.diff(mirrored, order, axis=0))
 
     def bends(self, coefficients: np.ndarray) -> np.ndarray:
-        """Mean squares over the currents of the third differences over the angle, where `roughness` has weights."""
-        return np.asarray(np.mean((self._across @ coefficients.reshape(self.rows, self.columns)) ** 2, axis=1))
+        """Squares of the third differences over the angle, by angle and current, where `roughness` has weights."""
+        return np.asarray((self._across @ coefficients.reshape(self.rows, self.columns)) ** 2)
 
     def roughness(self, weights: np.ndarray | None = None) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
         """Quadratic forms of the third differences over the angle, each with a weight, and over the current."""
-        across = self._across if weights is None else self._across * np.sqrt(weights)[:, None]
+        across = sparse.kron(self._across, sparse.eye(self.columns)).tocsr()
+        weighted = across if weights is None else across.multiply(np.ravel(weights)[:, None])
         along = np.diff(np.eye(self.columns), 3, axis=0)
-        return (sparse.kron(across.T @ across, sparse.eye(self.columns)).tocsr(),
+        return ((across.T @ weighted).tocsr(),
                 sparse.kron(sparse.eye(self.rows), along.T @ along).tocsr())

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg, ndimage, sparse
 from scipy.optimize import nnls
 
 from salient.identify.basis import FluxBasis
@@ -36,7 +36,13 @@ _CURRENT_WEIGHTS = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
 """Weights of the roughness, relative to the mean weight of a coefficient: those are taken with which the other pulses
 predict a pulse best, for a smoother map averages more noise and follows a corner less."""
 _FLAT_PART = 0.01
-"""Part of the mean square bend that is added to each: angles with less bend have nearly the same stiffness."""
+"""Part of the mean square bend that is added to each: places with less bend have nearly the same stiffness."""
+_ALIKE = 3
+"""Part of the currents over which a bend counts as one, for saturation rounds corners: of all in the first round, whose
+map has the most noise."""
+_SHARPENED, _LOWER, _HIGHER = 3, 1, 2
+"""Rounds in which the stiffness follows the bends of the map before; in these the weights of the round before are
+tried, and so many of the list that are less and that are more."""
 _FOLDS, _ROUGHER = 4, 0.1
 _EXACT_PART = 0.1
 """Least part of the residual that is not of the current's noise."""
@@ -130,7 +136,7 @@ class Fit:
     """A machine by its pulses. delta_rad: of the aligned angle from the rough one, by row of phases; drop_V: mean of a
     device; eccentricity_rad: cosine and sine of the encoder's error; offset_A: of currents beyond that at rest;
     conductance_S: of the iron; smoothness: weights of the roughness over angle and current; stiffness: of its bends
-    over the angle, or None of an equal one."""
+    over the angle, by angle and current, or None of an equal one."""
 
     basis: FluxBasis
     coefficients: np.ndarray
@@ -173,57 +179,102 @@ def solve(rows: Rows, phases: int, rotor_poles: int, current_max_A: float, angle
     for iteration in range(_ITERATIONS):
         problem = _problem(rows, phases, fit, linear=iteration == 0)
         if iteration == _SMOOTHED:
-            problem = _smoothed(problem, rows)
-            even = _solution(problem, rows, phases)
-            problem = _smoothed(replace(problem, fit=replace(problem.fit, stiffness=_stiffness(even))), rows)
+            problem = _smoothed(problem, rows, phases)
         fit = _solution(problem, rows, phases)
     return fit
 
 
-def _smoothed(problem: _Problem, rows: Rows) -> _Problem:
-    """The problem with the smoothness that predicts best."""
-    return replace(problem, fit=replace(problem.fit, smoothness=_smoothness(problem, rows)))
+def _smoothed(problem: _Problem, rows: Rows, phases: int) -> _Problem:
+    """The problem with the smoothness that predicts best. The stiffness begins as an equal one, whose map is round at
+    the corners and has noise between them. It follows the bends of that map, and of the next ones as long as pulses are
+    predicted better."""
+    folds = _folds(problem, rows)
+    error, smoothness = _smoothness(problem, folds, _ANGLE_WEIGHTS, _CURRENT_WEIGHTS)
+    problem = replace(problem, fit=replace(problem.fit, smoothness=smoothness))
+    basis = problem.fit.basis
+    for number in range(_SHARPENED):
+        alike = _ALIKE if number else 1
+        # The pulses of a fold have no part in the stiffness by which they are predicted: noise has bends, too.
+        others = [replace(fold, stiffness=_stiffness(basis, alike, _without(problem, folds, fold, smoothness)))
+                  for fold in folds]
+        less, smoother = _smoothness(problem, others, _near(_ANGLE_WEIGHTS, smoothness[0]),
+                                     _near(_CURRENT_WEIGHTS, smoothness[1]))
+        if number and less >= error:
+            break
+        stiffness = _stiffness(basis, alike, _solution(problem, rows, phases).coefficients)
+        problem = replace(problem, fit=replace(problem.fit, smoothness=smoother, stiffness=stiffness))
+        error, folds, smoothness = less, others, smoother
+    return problem
 
 
-def _stiffness(fit: Fit) -> np.ndarray:
-    """Weights of the bends over the angle by the bends of a map, with a mean of 1: where poles begin to overlap the
-    torque has corners, which one smoothness of all angles either rounds or pays for with noise at the others."""
-    bends = fit.basis.bends(fit.coefficients)
+def _near(weights: Sequence[float], weight: float) -> Sequence[float]:
+    """Weights of a list about one of it."""
+    at = weights.index(weight)
+    return weights[max(at - _LOWER, 0):at + _HIGHER + 1]
+
+
+def _stiffness(basis: FluxBasis, alike: int, unknowns: np.ndarray) -> np.ndarray:
+    """Weights of the bends over the angle, with a mean of 1, by the bends of a map, the first of the unknowns, in
+    1 / alike of the currents: where poles begin to overlap the torque has corners, which one smoothness of all places
+    either rounds or pays for with noise at the others. Currents that no pulse reaches stay stiff, for the bends there
+    are only continued."""
+    squares = basis.bends(unknowns[:basis.size])
+    bends = (ndimage.uniform_filter1d(squares, max(1, squares.shape[1] // alike), axis=1, mode="nearest") if alike > 1
+             else np.repeat(squares.mean(axis=1, keepdims=True), squares.shape[1], axis=1))
     stiffness = 1.0 / (bends + _FLAT_PART * np.mean(bends))
     return np.asarray(stiffness / np.mean(stiffness))
 
 
-def _smoothness(problem: _Problem, rows: Rows) -> tuple[float, float]:
-    """Weights of the roughness by prediction of each pulse from the pulses of other folds, of the linear problem.
-    IdentifyError: with no weights do these determine the machine."""
+@dataclass(frozen=True)
+class _Fold:
+    """Pulses that are left out: rows and normal equations of their own, stiffness of the map by the others."""
+
+    design: sparse.csr_matrix
+    weights: np.ndarray
+    flux_Wb: np.ndarray
+    normal: sparse.csr_matrix
+    right: np.ndarray
+    stiffness: np.ndarray | None
+
+
+def _folds(problem: _Problem, rows: Rows) -> list[_Fold]:
     folds = []
-    for fold in range(_FOLDS):
-        kept = rows.pulse % _FOLDS == fold
+    for number in range(_FOLDS):
+        kept = rows.pulse % _FOLDS == number
         design, weights, flux = problem.design[kept], problem.weights[kept], rows.flux_Wb[kept]
         weighted = design.multiply(weights[:, None]).tocsr()
-        folds.append((design, weights, flux, (weighted.T @ design).tocsr(), weighted.T @ flux))
-    normal, right = sum(each[3] for each in folds), sum(each[4] for each in folds)
+        folds.append(_Fold(design, weights, flux, (weighted.T @ design).tocsr(), weighted.T @ flux,
+                           problem.fit.stiffness))
+    return folds
 
+
+def _without(problem: _Problem, folds: Sequence[_Fold], left_out: _Fold, smoothness: tuple[float, float]) -> np.ndarray:
+    """The solution of the pulses of the other folds, but for the signs. LinAlgError: they do not determine it."""
+    normal = sum(fold.normal for fold in folds if fold is not left_out) + sparse.diags(problem.ridge)
+    right = sum(fold.right for fold in folds if fold is not left_out) + problem.pull
+    return _solved(normal + _forms(problem, smoothness, left_out.stiffness), right, problem.fit.basis)
+
+
+def _smoothness(problem: _Problem, folds: Sequence[_Fold], by_angles: Sequence[float], by_currents: Sequence[float]
+                ) -> tuple[float, tuple[float, float]]:
+    """Least error and weights of the roughness by prediction of each pulse from the pulses of other folds, of the
+    linear problem. IdentifyError: with no weights do these determine the machine."""
     def error(smoothness: tuple[float, float]) -> float:
-        of_all = normal + sparse.diags(problem.ridge) + _forms(problem, smoothness)
-        total = 0.0
-        for design, weights, flux, of_normal, of_right in folds:
-            try:
-                x = _solved(of_all - of_normal, right - of_right + problem.pull, problem.fit.basis)
-            except linalg.LinAlgError:
-                return math.inf
-            total += float(weights @ (flux - design @ x)**2)
-        return total
+        try:
+            left = [fold.flux_Wb - fold.design @ _without(problem, folds, fold, smoothness) for fold in folds]
+        except linalg.LinAlgError:
+            return math.inf
+        return sum(float(fold.weights @ of**2) for fold, of in zip(folds, left, strict=True))
 
-    def best(candidates: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    def best(candidates: Sequence[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
         least, found = min((error(each), each) for each in candidates)
         if math.isinf(least):
             raise IdentifyError(f"{_FOLDS - 1} of {_FOLDS} pulses do not determine the machine: they are too few")
-        return found
+        return least, found
 
-    by_angle, by_current = problem.fit.smoothness
-    by_angle, _ = best([(weight, by_current) for weight in _ANGLE_WEIGHTS])
-    return best([(by_angle, weight) for weight in _CURRENT_WEIGHTS])
+    _, by_current = problem.fit.smoothness
+    _, (by_angle, _) = best([(weight, by_current) for weight in by_angles])
+    return best([(by_angle, weight) for weight in by_currents])
 
 
 def _corrected(rows: Rows, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -260,9 +311,9 @@ def _signs(basis: FluxBasis) -> sparse.csr_matrix:
     return sparse.vstack([rises, falls]).tocsr()
 
 
-def _forms(problem: _Problem, smoothness: tuple[float, float]) -> sparse.csr_matrix:
+def _forms(problem: _Problem, smoothness: tuple[float, float], stiffness: np.ndarray | None) -> sparse.csr_matrix:
     """Quadratic form of the roughness of a map, in all unknowns."""
-    by_angle, by_current = problem.fit.basis.roughness(problem.fit.stiffness)
+    by_angle, by_current = problem.fit.basis.roughness(stiffness)
     of_map = problem.scale * (smoothness[0] * by_angle + smoothness[1] * by_current
                               + 1e-12 * sparse.eye(problem.fit.basis.size))
     return _widened(of_map, problem.design.shape[1])
@@ -344,7 +395,7 @@ def _solution(problem: _Problem, rows: Rows, phases: int, drawn: np.ndarray | No
     n = fit.basis.size
     weights = problem.weights if drawn is None else problem.weights * drawn
     weighted = design.multiply(weights[:, None]).tocsr()
-    normal = weighted.T @ design + sparse.diags(problem.ridge) + _forms(problem, fit.smoothness)
+    normal = weighted.T @ design + sparse.diags(problem.ridge) + _forms(problem, fit.smoothness, fit.stiffness)
     x = _constrained(problem, normal.tocsr(), weighted.T @ rows.flux_Wb + problem.pull, n)
     more = np.zeros(2 * phases + 4) if problem.linear else x[n + 2:]
     return Fit(fit.basis, x[:n], float(x[n]), float(x[n + 1]), fit.delta_rad + more[:phases],
