@@ -219,7 +219,7 @@ def test_ratio_is_to_the_condition_that_a_run_is_relative_to():
     (("--machine", "nonesuch"), "machine 'nonesuch': no such file"),
     (("--set", "torque_max_Nm=1,2"), "--set torque_max_Nm=1,2: must be one value"),
     (("--set", "torque_max_Nm=high"), "--set torque_max_Nm=high: must be NAME=VALUE"),
-    (("--baseline", "nonesuch.json"), "--baseline nonesuch.json: No such file"),
+    (("--baseline", "nonesuch.json"), "--baseline nonesuch.json: no such file"),
 ])
 def test_an_option_is_refused_before_a_case_or_its_files_are_made(monkeypatch, tmp_path, options, refusal):
     made = []
