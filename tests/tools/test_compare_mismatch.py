@@ -229,6 +229,19 @@ def test_an_option_is_refused_before_a_case_or_its_files_are_made(monkeypatch, t
     assert made == [] and not (tmp_path / "out").exists()
 
 
+def test_machine_files_of_a_folder_without_results_of_a_run_stay(monkeypatch, tmp_path):
+    monkeypatch.setitem(GROUPS, "mismatch", replace(GROUPS["mismatch"], cases=lambda quick: []))
+    kept = [tmp_path / "machines" / "mine" / "motor.toml", tmp_path / "failed" / "mine.toml"]
+    for path in kept:
+        path.parent.mkdir(parents=True)
+        path.write_text("of the user")
+    assert compare("mismatch", "--out", tmp_path)[0] == 0
+    assert all(path.read_text() == "of the user" for path in kept)
+    kept[1].write_text("of the run before")
+    assert compare("mismatch", "--out", tmp_path)[0] == 0
+    assert not kept[1].exists()  # beside the results of a run
+
+
 @pytest.mark.in_turns
 def test_quick_group_has_files_ratios_and_plots(tmp_path):
     code, output = compare("mismatch", "--quick", "--jobs", 2, "--out", tmp_path)

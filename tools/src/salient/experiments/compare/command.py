@@ -20,6 +20,7 @@ from salient.experiments.compare.machine import Subject, cases_of, subject, targ
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
 from salient.experiments.scenario import check_parameters, with_setting
+from salient.experiments.tasks import RESULTS
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 from salient.paths import COMMAND, make_folder
@@ -49,8 +50,7 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     if options.true_machine is not None:
         cases = [replace(case, scenario=replace(case.scenario, true_machine=options.true_machine)) for case in cases]
     cases = _with_settings(_first_samples(cases, options.samples), settings)
-    make_folder(options.out, (f"{FAILED}/*.toml", f"{mismatch.FILES}/*/*.*", results_file.NAME, PAGE,
-                              summary_file.NAME))
+    make_folder(options.out, _of_earlier_run(options.out))
     machine_files = mismatch.copy_files(cases, options.out)
     runs = run_all(cases, options.jobs, sys.stderr, options.out, not options.resume, options.scheduler)
     rows = table.make_rows(runs, targets)
@@ -82,6 +82,14 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
                      f" {shlex.quote(str(wrong))} --true-machine {shlex.quote(right)}\n")
     stream.write(f"\nresults: {options.out / results_file.NAME}\npage:    {options.out / 'compare.html'}\n")
     return 1 if any(change.worse for change in changes) else 0
+
+
+def _of_earlier_run(out: Path) -> Sequence[str]:
+    """Patterns of the files that an earlier run has left in a folder: none without its results, since a folder of the
+    user may have machine files and failed scenarios of his own."""
+    if not any((out / name).is_file() for name in (results_file.NAME, RESULTS)):
+        return ()
+    return f"{FAILED}/*.toml", f"{mismatch.FILES}/*/*.*", results_file.NAME, PAGE, summary_file.NAME
 
 
 def _groups(named: Sequence[str]) -> list[str]:
