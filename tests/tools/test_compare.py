@@ -730,11 +730,15 @@ def test_same_drive_has_no_change_and_a_modified_baseline_is_detected(start_fold
 
 
 @pytest.mark.parametrize(("content", "expected_text"), [
-    (None, "No such file"),
+    (None, "no such file"),
     ("{", "not JSON"),
     ("[]", "schema 1"),
     ('{"schema": 2, "rows": []}', "schema 1"),
     ('{"schema": 1, "quick": true, "rows": []}', "made with --quick"),
+    ('{"schema": 1, "quick": false, "rows": [1]}', "schema 1: rows.0"),
+    ('{"schema": 1, "quick": false, "rows": [{"group": "start"}]}', "schema 1: rows.0.condition"),
+    ('{"schema": 1, "quick": false, "rows": [{"group": "start", "condition": "a", "figure": "b", "statistic": "",'
+     ' "values": {"paper": "1"}, "failed": {}}]}', "schema 1: rows.0.values.paper"),
 ])  # fmt: skip
 def test_invalid_baseline_is_reported(tmp_path, content, expected_text):
     path = tmp_path / "earlier.json"

@@ -213,10 +213,33 @@ def test_ratio_is_to_the_condition_that_a_run_is_relative_to():
     assert row.label == "K_t from 20 ms after a load step, of the right file's" and row.values == {"salient": 2.0}
 
 
-@pytest.mark.in_turns
-def test_true_machine_of_the_user_is_refused():
-    with pytest.raises(UsageError, match="--true-machine linear_cosine: not with mismatch"):
-        compare("mismatch", "--machine", "saturating", "--true-machine", "linear_cosine")
+@pytest.mark.parametrize(("options", "refusal"), [
+    (("--machine", "saturating", "--true-machine", "linear_cosine"), "--true-machine linear_cosine: not with mismatch"),
+    (("--true-machine", "linear_cosine"), "--true-machine linear_cosine: only with --machine"),
+    (("--machine", "nonesuch"), "machine 'nonesuch': no such file"),
+    (("--set", "torque_max_Nm=1,2"), "--set torque_max_Nm=1,2: must be one value"),
+    (("--set", "torque_max_Nm=high"), "--set torque_max_Nm=high: must be NAME=VALUE"),
+    (("--baseline", "nonesuch.json"), "--baseline nonesuch.json: no such file"),
+])
+def test_an_option_is_refused_before_a_case_or_its_files_are_made(monkeypatch, tmp_path, options, refusal):
+    made = []
+    monkeypatch.setitem(GROUPS, "mismatch", replace(GROUPS["mismatch"], cases=lambda quick: made.append(quick) or []))
+    with pytest.raises(UsageError, match=re.escape(refusal)):
+        compare("mismatch", *options, "--out", tmp_path / "out")
+    assert made == [] and not (tmp_path / "out").exists()
+
+
+def test_machine_files_of_a_folder_without_results_of_a_run_stay(monkeypatch, tmp_path):
+    monkeypatch.setitem(GROUPS, "mismatch", replace(GROUPS["mismatch"], cases=lambda quick: []))
+    kept = [tmp_path / "machines" / "mine" / "motor.toml", tmp_path / "failed" / "mine.toml"]
+    for path in kept:
+        path.parent.mkdir(parents=True)
+        path.write_text("of the user")
+    assert compare("mismatch", "--out", tmp_path)[0] == 0
+    assert all(path.read_text() == "of the user" for path in kept)
+    kept[1].write_text("of the run before")
+    assert compare("mismatch", "--out", tmp_path)[0] == 0
+    assert not kept[1].exists()  # beside the results of a run
 
 
 @pytest.mark.in_turns

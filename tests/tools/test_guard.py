@@ -15,7 +15,7 @@ from kills import left_of, wait_until_nothing
 BEGIN = """
 import os, signal, socket, subprocess, sys, tempfile
 from pathlib import Path
-from salient.guard import guarded, removes
+from salient.guard import guarded, removes, removes_socket
 
 def start(code, **options):
     subprocess.Popen([sys.executable, "-c", "import signal; " + code], **options)
@@ -36,7 +36,7 @@ CHILDREN = """
 removes(Path("partial"))
 Path("partial").write_text("half")
 server = socket.socket(socket.AF_UNIX)
-removes(Path("server.sock"))
+removes_socket(Path("server.sock"))
 server.bind("server.sock")
 start("signal.pause()")
 start(DEAF, start_new_session=True)
@@ -94,6 +94,21 @@ def test_socket_that_another_process_serves_stays(tmp_path: Path) -> None:
         assert path.is_socket()
 
 
+def test_file_or_folder_in_the_place_of_a_bus_stays_when_sim_refuses_it(tmp_path: Path) -> None:
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "folder").mkdir()
+    for name in ("file", "folder/file"):
+        (tmp_path / name).write_text("of the user")
+    for name in ("file", "folder"):
+        done = subprocess.run([sys.executable, "-m", "salient", "sim", "--can", f"unix:{tmp_path / name}"],
+                              capture_output=True, text=True, check=False,
+                              env={**os.environ, MARK: str(tmp_path), "TMPDIR": str(tmp_path / "tmp")})
+        assert done.returncode == 2
+        assert done.stderr == f"salient: --can unix:{tmp_path / name}: exists and is not a socket\n"
+    assert left_in(tmp_path) == []
+    assert (tmp_path / "file").read_text() == (tmp_path / "folder" / "file").read_text() == "of the user"
+
+
 def test_temporary_files_are_gone_when_the_process_has_ended_in_order(tmp_path: Path) -> None:
     with start(BEGIN + "context.__exit__(None, None, None)", tmp_path) as process:
         process.communicate()
@@ -104,7 +119,7 @@ def test_process_of_no_run_goes_on(tmp_path: Path) -> None:
     """As the installation of a Debian package, which must not be cut off."""
     code = BEGIN + ("sleeper = subprocess.Popen(['env', '-u', RUNS, '-u', 'TMPDIR', sys.executable, '-c', "
                     "'import signal; signal.pause()'])\nprint(sleeper.pid)")
-    with start(code.replace("guarded, removes", "RUNS, guarded, removes"), tmp_path) as process:
+    with start(code.replace("guarded, removes,", "RUNS, guarded, removes,"), tmp_path) as process:
         assert process.stdout is not None
         other = int(process.stdout.readline())
         process.wait()

@@ -13,7 +13,7 @@ import threading
 import can
 import pytest
 
-from salient.bus import clock, monitor
+from salient.bus import clock, monitor, signals
 
 
 @pytest.fixture
@@ -91,6 +91,26 @@ def test_monitor_prints_one_line_per_interval(listen):
     assert errors == f"salient: {bench.address}: the drive's bus closed: the drive was stopped\n"
     assert 8 <= len(lines) <= 10
     assert all("state        run" in line and "reference    600.00 r/min" in line for line in lines[1:])
+
+
+def lines_of_log(salient_without_build, path, spans):
+    """Times of the lines of a monitor over a log of a drive's torque each millisecond, in spans of milliseconds."""
+    identifier = signals.drive_database().get_message_by_name("DRIVE_TORQUE").frame_id
+    path.write_text("".join(f"({at_ms / 1000:.6f}) can0 {identifier:03X}#{'00' * 8}\n"
+                            for span in spans for at_ms in span))
+    result = salient_without_build("monitor", "--replay", path)
+    assert result.returncode == 0
+    return [float(line.split()[0]) for line in result.stdout.splitlines()]
+
+
+def test_pause_of_a_log_has_one_line_at_its_end_and_the_period_goes_on(salient_without_build, tmp_path):
+    times_s = lines_of_log(salient_without_build, tmp_path / "pause.log", [range(251), range(99_960, 100_151)])
+    assert times_s == [0.1, 0.2, 99.96, 100.0, 100.1]
+
+
+def test_monitor_goes_on_with_a_recording_that_follows_in_a_log_with_earlier_times(salient_without_build, tmp_path):
+    times_s = lines_of_log(salient_without_build, tmp_path / "two.log", [range(5_000, 5_301), range(301)])
+    assert times_s == [5.1, 5.2, 5.3, 0.1, 0.2, 0.3]
 
 
 @pytest.mark.parametrize(("command", "activity"), [("log", "recording"), ("monitor", "monitoring")])

@@ -158,6 +158,30 @@ def test_teardown_that_fails_after_the_call_has_a_folder_of_its_own(tmp_path):
     assert note["machine"] == str(machine)
 
 
+OF_EQUAL_NAMES = '''
+import pytest
+
+NAMES = ["1", "+1", "r/min", "r min", "n" * 300]
+
+@pytest.mark.parametrize("speed", NAMES, ids=NAMES)
+def test_speed(bench, speed):
+    assert speed == "none"
+'''
+
+
+def test_every_parameter_of_a_test_has_a_folder_whatever_its_characters_and_length(tmp_path):
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    (tmp_path / "test_names.py").write_text(OF_EQUAL_NAMES)
+    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], cwd=tmp_path,
+                          capture_output=True, text=True, check=False)
+    assert "nothing saved" not in done.stdout and "5 failed" in done.stdout
+    folders = sorted((tmp_path / "build" / "failures").iterdir())
+    tests = [json.loads((folder / "failure.json").read_text())["test"] for folder in folders]
+    assert sorted(tests) == sorted(f"test_names.py::test_speed[{each}]" for each in (
+        "1", "+1", "r/min", "r min", "n" * 300))
+    assert folders[0].name == "test_names.py_test_speed_1"
+
+
 def test_a_folder_that_is_used_again_has_nothing_of_the_earlier_failure(tmp_path, bench):
     for name in (*LEFT, "notes.txt"):
         (tmp_path / name).write_text("of an earlier failure")

@@ -19,6 +19,7 @@ from salient.experiments import sweep
 from salient.experiments.compare.command import run as compare
 from salient.experiments.tasks import read_results
 from salient.machine.parameter_table import read_table
+from salient.machine.path import machine_path
 
 SCENARIO = """
 machine = "saturating"
@@ -154,11 +155,26 @@ def test_no_column_of_metrics_is_the_name_of_a_setting():
     (("--load-Nm", "1,20000"), "--load-Nm 20000: must be a number from -10000 to 10000"),
     (("--machine", "nonesuch"), "nonesuch"),
     (("--load-profile", "nonesuch"), "load_profile 'nonesuch': no such file"),
+    (("--machine", "saturating", "--machine", "saturating"), "--machine saturating: given twice"),
+    (("--controller", "paper", "--controller", "paper"), "--controller paper: given twice"),
+    (("--load-Nm", "1,2,1.0"), "--load-Nm 1.0: given twice"),
 ])
 def test_invalid_sweep_is_refused_before_the_first_run(scenario, tmp_path, arguments, error):
     with pytest.raises(UsageError, match=error):
         sweep.run(options(scenario, tmp_path / "out", *arguments), io.StringIO())
     assert not (tmp_path / "out").exists()
+
+
+def test_machine_files_of_one_name_have_columns_that_tell_them_apart(scenario, tmp_path):
+    files = [tmp_path / folder / "motor.toml" for folder in ("one", "two")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text(machine_path("saturating").read_text().replace('"saturating"', '"motor"', 1))
+    machines = [option for file in (*files, "linear_cosine") for option in ("--machine", str(file))]
+    found = sweep.runs_of(options(scenario, tmp_path, *machines))
+    assert [of.columns["machine"] for of in found] == [*map(str, files), "linear_cosine"]
+    with pytest.raises(UsageError, match="two/../one/motor.toml: given twice"):
+        sweep.runs_of(options(scenario, tmp_path, *machines, "--machine", f"{tmp_path}/two/../one/motor.toml"))
 
 
 def compared(out: Path, *arguments: str) -> dict[str, object]:

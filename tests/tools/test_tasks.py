@@ -67,13 +67,13 @@ def test_interrupted_run_continues_and_a_cut_line_is_done_again(tmp_path):
     assert sorted(keys) == sorted(SQUARE_ROOTS)
 
 
-@pytest.mark.parametrize("line", ["not JSON", '["key", 1]', '{"result": 1}'])
+@pytest.mark.parametrize("line", [b"not JSON", b'["key", 1]', b'{"result": 1}', b"\xff\xfe"])
 def test_a_line_that_is_no_result_is_named_and_the_file_kept(line, tmp_path):
     path = tmp_path / RESULTS
-    path.write_text(f'{{"key": "4", "result": 2}}\n{line}\n')
+    path.write_bytes(b'{"key": "4", "result": 2}\n' + line + b"\n")
     with pytest.raises(UsageError, match=r"runs.jsonl, line 2: not the result of a run; choose another folder"):
         results(tmp_path, jobs=1)
-    assert path.read_text().endswith(f"{line}\n")
+    assert path.read_bytes().endswith(line + b"\n")
 
 
 def test_shards_are_disjoint_and_together_complete(tmp_path):

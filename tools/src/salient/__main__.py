@@ -10,7 +10,7 @@ from pathlib import Path
 from salient.cli import make_parser
 from salient.config import OPTIONS
 from salient.errors import RunFailed, UsageError, exit_code
-from salient.guard import removes
+from salient.guard import removes_socket
 from salient.kept_files import keep_read_files
 from salient.light_can import without_mf4
 from salient.paths import BUILD, OUT, make_folder, scenario_path
@@ -82,7 +82,7 @@ def _sim(options: argparse.Namespace) -> int:
     config = bench_config(given)
     command = command_line(config)
     if config.can.startswith("unix:"):
-        removes(Path(config.can.removeprefix("unix:")))
+        removes_socket(Path(config.can.removeprefix("unix:")))
     os.execv(command[0], command)
 
 

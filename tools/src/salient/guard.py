@@ -5,7 +5,8 @@
 
 A process that ends by SIGKILL can do nothing about what it has started and written, and one that ends by SIGTERM or
 SIGHUP is no better. Therefore a second process, which this file is when it is executed, waits for the end of the
-first. It then ends all processes that belong to the run, and removes the folder of the run and what removes() names.
+first. It then ends all processes that belong to the run, and removes the folder of the run, and what removes() and
+removes_socket() name.
 
 A process belongs to a run when its environment names the folder of the run, or when it has this folder open, as what
 is forked without being executed has. Runs can be nested, as the commands that a test suite starts: a process belongs
@@ -27,7 +28,7 @@ from pathlib import Path
 
 RUNS = "SALIENT_RUNS"
 """Environment variable: the folders of the runs that a process belongs to, the outermost first."""
-_LIST = "removed_at_the_end"
+_LIST, _SOCKETS = "removed_at_the_end", "sockets_removed_at_the_end"
 _PIDFD = 3
 _TERM_GRACE_S = 5.0
 """Time in which a process may end its recordings and remove its files before it is killed."""
@@ -53,9 +54,26 @@ def guarded() -> Generator[None, None, None]:
 
 def removes(path: Path) -> None:
     """A file, folder or socket of this name is removed when the run has ended; a socket only without a server."""
+    _note(_LIST, path)
+
+
+def removes_socket(path: Path) -> None:
+    """A socket of this name, which the user has chosen, is removed when the run has ended, without a server; a file or
+    a folder of this name is not of the run."""
+    _note(_SOCKETS, path)
+
+
+def _note(name: str, path: Path) -> None:
     if folder := _folder():
-        with suppress(OSError), (folder / _LIST).open("ab") as file:
+        with suppress(OSError), (folder / name).open("ab") as file:
             file.write(os.fsencode(path.absolute()) + b"\0")
+
+
+def _noted(name: str, folder: Path) -> list[Path]:
+    try:
+        return [Path(os.fsdecode(path)) for path in (folder / name).read_bytes().split(b"\0") if path]
+    except OSError:
+        return []
 
 
 def outside() -> Path:
@@ -122,7 +140,7 @@ def _end() -> None:
     if not runs:
         del os.environ[RUNS]
     os.environ["TMPDIR"] = tempfile.tempdir = str(_folder() or folder.parent)
-    if not (folder / _LIST).exists():
+    if not any((folder / name).exists() for name in (_LIST, _SOCKETS)):
         _remove(folder)
 
 
@@ -140,15 +158,12 @@ def main(pid: int, folder: Path) -> None:
     begin = _begin_of(pid)
     select.select([_PIDFD], [], [])
     _end_processes(str(folder), begin)
-    try:
-        named = [Path(os.fsdecode(name)) for name in (folder / _LIST).read_bytes().split(b"\0") if name]
-    except OSError:
-        named = []
+    named, chosen = _noted(_LIST, folder), _noted(_SOCKETS, folder)
     _remove(folder)
     for path in named:
         if not path.is_socket():
             _remove(path)
-    if sockets := [path for path in named if path.is_socket()]:
+    if sockets := [path for path in (*named, *chosen) if path.is_socket()]:
         time.sleep(_CLIENTS_LOOK_S)
         served = Path("/proc/net/unix").read_bytes().split()
         for path in sockets:

@@ -3,7 +3,6 @@ and replay command."""
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -20,6 +19,7 @@ from salient.bus.log import write_logs
 from salient.config import BenchConfig
 from salient.dbc import PHASES, PHASES_MIN
 from salient.errors import RunFailed
+from salient.json_file import json_text
 from salient.paths import COMMAND
 
 BEFORE_S, AFTER_S = 0.05, 0.01
@@ -81,7 +81,7 @@ def save(session: Session, folder: Path, notes: dict[str, Any], config: BenchCon
     if simulator is not None:
         about |= {"simulator": shlex.join(simulator.command), "stderr": simulator.errors}
     about |= {"view": f"{COMMAND} view --replay {shlex.quote(str(folder))}"} | notes
-    (folder / "bench.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    (folder / "bench.json").write_text(json_text(about), encoding="utf-8")
     scopes = _save_scopes(session, folder)
     _write_page(folder, about | {"error": error, STIMULI: [str(stimulus) for stimulus in acts]}, title, scopes)
     return Saved(last, drive, [str(stimulus) for stimulus in acts], changed)

@@ -21,11 +21,11 @@ the test bench are skipped. With an interface, tests of the two marks for transp
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import re
 import shlex
 import sys
+import zlib
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +40,7 @@ from salient.bench.bench import Bench
 from salient.bench.session import Session
 from salient.config import CONTROLLERS, HOST_BUILDS, TARGET_BUILDS, TARGETS, WASM_BUILD
 from salient.errors import UsageError
+from salient.json_file import json_text
 from salient.machine.cache import bench_config, check_options
 from salient.paths import COMMAND
 from salient.tab.link import link_of
@@ -64,6 +65,8 @@ class _State:
     saved: dict[int, Path] = field(default_factory=dict)
 
 
+_FOLDER_NAME_MAX = 200
+"""Characters of the name of a folder; a file system takes 255 bytes, with the checksum and the phase of a test."""
 _state_key = pytest.StashKey[_State]()
 
 
@@ -260,12 +263,21 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]
         del item.stash[_state_key]  # pytest keeps the items of a run to its end: the benches would stay with their logs
 
 
+def _folder_name(test: str) -> str:
+    """The folder of a test's failures, its name with "_" between the parts. A parameter with other characters, as +1
+    beside 1, or a name longer than a file system takes, has a checksum besides: no test shares a folder."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", test).strip("_")
+    if len(name) <= _FOLDER_NAME_MAX and re.fullmatch(r"[^\[]*(\[[A-Za-z0-9_.-]+\])?", test):
+        return name
+    return f"{name[:_FOLDER_NAME_MAX]}_{zlib.crc32(test.encode()):08x}"
+
+
 def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     """Writes the folder of a failure; the lines tell of it. A failure of the teardown after another one adds its error
     alone, in a folder of its own."""
     state = item.stash.setdefault(_state_key, _State())
     parent = Path(item.config.getoption("--salient-failures") or item.config.rootpath / "build" / "failures")
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", item.nodeid).strip("_")
+    name = _folder_name(item.nodeid)
     folder = parent.absolute() / (name if state.folder is None else f"{name}_{report.when}")
     command = _replay(item)
     notes = {"test": item.nodeid, "phase": report.when, "replay": command, "replay_in": str(item.config.rootpath)}
@@ -273,7 +285,7 @@ def _save(item: pytest.Item, report: pytest.TestReport) -> list[str]:
     for of_earlier_bench in folder.glob("[0-9]*"):
         failure.clear(of_earlier_bench)
     error = {"error": report.longreprtext.splitlines()}
-    (folder / "failure.json").write_text(json.dumps(notes | error, indent=2) + "\n", encoding="utf-8")
+    (folder / "failure.json").write_text(json_text(notes | error), encoding="utf-8")
     lines = [f"folder: {folder}"]
     if state.folder is not None:
         return lines

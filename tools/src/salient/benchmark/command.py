@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import statistics
 import sys
@@ -19,6 +18,7 @@ from salient.benchmark.switching_pattern import record
 from salient.config import CONTROLLERS, BenchConfig
 from salient.errors import UsageError
 from salient.experiments.network_ablation import run_ablation
+from salient.json_file import json_text
 from salient.progress import Progress
 from salient.reference.ngspice import NgspiceError
 from salient.target import isr_profile
@@ -154,7 +154,7 @@ def run(runs: int, json_path: Path | None, page_s: float | None = None, tab: boo
 
 def _write(json_path: Path | None, content: dict[str, Any]) -> None:
     if json_path is not None:
-        json_path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        json_path.write_text(json_text(content), encoding="utf-8")
 
 
 def _speed(runs: int) -> list[dict[str, Any]]:

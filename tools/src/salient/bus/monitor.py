@@ -94,8 +94,7 @@ def monitor(options: argparse.Namespace) -> int:
     carrier = Carrier(address, options.machine, options.node)
     others = load_databases(options.dbc, options.node)
     lines = _Lines(options, others)
-    due_ns, closed = None, None
-    every_ns = round(options.every_s * 1e9)
+    period, closed = _Period(round(options.every_s * 1e9)), None
     heard = True
     nodes = _Nodes(address, options.node, others, lines.traffic)
     frames = nodes.watch(_frames(address, options.duration_s, "monitoring", nodes) if options.replay is None
@@ -106,17 +105,16 @@ def monitor(options: argparse.Namespace) -> int:
                 lines.decode_as(carrier.likely)
                 heard = carrier.machine is not None
             lines.add(time_ns, message)
-            due_ns = time_ns + every_ns if due_ns is None else due_ns
-            if time_ns < due_ns:
+            if not period.ends(time_ns):
                 continue
             line = lines.line(time_ns)
             if line and not heard and carrier.machine is None and not nodes.absent:
                 heard = True
+                hint = "; --machine states another" if options.machine is None else ", of --machine"
                 print(f"salient: {address}: no DRIVE_IDENTITY within {IDENTITY_WAIT_NS / 1e9:g} s: the signals are "
-                      f"taken for {carrier.likely}'s; --machine states another", file=sys.stderr, flush=True)
+                      f"taken for {carrier.likely}'s{hint}", file=sys.stderr, flush=True)
             if line:
                 _write(line)
-            due_ns += every_ns
     except KeyboardInterrupt:
         pass
     except _BusClosed as end:
@@ -135,6 +133,25 @@ def _tell_events(traffic: Traffic) -> None:
     """Prints what has gone missing and what is back."""
     for event in traffic.take_events():
         _write(event_line(event))
+
+
+class _Period:
+    """The period of the lines, in the time of the frames: a pause has one end of a period, whatever its length."""
+
+    def __init__(self, every_ns: int) -> None:
+        self._every_ns = every_ns
+        self._due_ns: int | None = None
+
+    def ends(self, time_ns: int) -> bool:
+        """Whether a period ends with the frame of a time. A time that is a period before the last end begins again:
+        another recording follows in the log, or the drive has restarted."""
+        if self._due_ns is None or time_ns < self._due_ns - 2 * self._every_ns:
+            self._due_ns = time_ns + self._every_ns
+        if time_ns < self._due_ns:
+            return False
+        if self._every_ns > 0:
+            self._due_ns += ((time_ns - self._due_ns) // self._every_ns + 1) * self._every_ns
+        return True
 
 
 class _Lines:

@@ -48,7 +48,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator
@@ -74,6 +73,7 @@ from salient.dbc import PHASES
 from salient.errors import UsageError, close_names
 from salient.experiments.consistency import check_consistency
 from salient.experiments.metrics import losses
+from salient.json_file import json_text
 from salient.machine.cache import machine_image
 from salient.machine.file import load_machine, machine_path
 from salient.machine.path import stated_conditions
@@ -385,8 +385,7 @@ def write_summaries(scenarios: list[Scenario], results: dict[str, RunResult], ou
         "scenario": {key: value for key, value in asdict(scenarios[0]).items() if key != "controller"},
         "controllers": {controller: summary(result) for controller, result in results.items()},
     }
-    text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-    (out_dir / "results.json").write_text(text, encoding="utf-8")
+    (out_dir / "results.json").write_text(json_text(content, sort_keys=True), encoding="utf-8")
 
 
 # --- reading --------------------------------------------------------------------------------------------------------

@@ -51,6 +51,8 @@ METRICS = ("settling_time_s", "overshoot_percent", "max_speed_rpm", "final_speed
            "recovery_time_s", "highest_torque_Nm", "lowest_torque_Nm", "mean_torque_Nm", "torque_ripple",
            "phase_current_rms_A", "efficiency_percent")
 """Columns of every table, none of which is the name of a setting; empty where a run has no such metric."""
+_FLAGS = {"machine": "--machine", "controller": "--controller", "load_Nm": "--load-Nm",
+          "load_profile": "--load-profile"}
 _STEADY_S = 0.1
 """At the end of a run: window of the mean torque, its ripple and the losses."""
 
@@ -119,11 +121,14 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
         axes["load_profile"] = options.load_profile
     first_seed = base[0].seed if options.seed is None else options.seed
     axes["seed"] = [first_seed + n for n in range(options.seeds)]
+    for name, of_axis in axes.items():
+        _check_different(name, of_axis)
+    shown = _machine_names(axes["machine"])
     program = tasks.file_digest(executable())
     found = []
     for combination in itertools.product(*axes.values()):
         columns = dict(zip(axes, combination, strict=True))
-        found.append(Run({**columns, "machine": Path(columns["machine"]).stem}, _scenario(base[0], columns), program))
+        found.append(Run({**columns, "machine": shown[columns["machine"]]}, _scenario(base[0], columns), program))
     checked = {repr(replace(of.scenario, seed=base[0].seed)): replace(of.scenario, seed=base[0].seed) for of in found}
     try:
         check_parameters(list(checked.values()), "host")
@@ -131,6 +136,24 @@ def runs_of(options: argparse.Namespace) -> list[Run]:
         check_parameters(base[:1], "host", scenario_path(options.scenario))  # a mistake of the file, or of an option
         raise
     return found
+
+
+def _check_different(name: str, values: Sequence[Any]) -> None:
+    """UsageError: an option has a value twice, whose rows nothing would tell apart."""
+    path = {"machine": machine_path, "load_profile": load_profile_path}.get(name, lambda value: value)
+    seen: set[Any] = set()
+    for value in values:
+        meant = path(value)
+        meant = meant.resolve() if isinstance(meant, Path) else meant
+        if meant in seen:
+            raise UsageError(f"{_FLAGS.get(name, name)} {value}: given twice; must be different values")
+        seen.add(meant)
+
+
+def _machine_names(machines: Sequence[str]) -> dict[str, str]:
+    """The column of each machine: the name of its file without a suffix; as stated where several have that name."""
+    stems = [Path(machine).stem for machine in machines]
+    return {machine: stem if stems.count(stem) == 1 else machine for machine, stem in zip(machines, stems, strict=True)}
 
 
 def _scenario(base: Scenario, columns: Mapping[str, Any]) -> Scenario:

@@ -119,9 +119,8 @@ def read_results(out: Path) -> dict[str, Any]:
     a line has none."""
     results = {}
     for path in sorted(out.glob("runs*.jsonl")):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), start=1):
-            if not line.endswith("\n"):
-                continue
+        *lines, _ = path.read_bytes().split(b"\n")
+        for number, line in enumerate(lines, start=1):
             try:
                 entry = json.loads(line)
                 results[entry["key"]] = entry["result"]

@@ -6,7 +6,6 @@ Writes the files of `run`, and processor.json and report.html next to results.js
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from salient.experiments.scenario import (
     with_true_machine,
     write_summaries,
 )
+from salient.json_file import json_text
 from salient.paths import OUT, make_folder, scenario_path
 from salient.target.control_period import CYCLES_PER_INSTRUCTION, PROCESSOR_HZ, estimable, fits
 from salient.target.isr_profile import IsrProfile, measure_run
@@ -110,7 +110,7 @@ def _run_scenario(path: Path, out: Path, target: str, true_machine: str | None) 
     write_summaries(scenarios, results, out)
     content = {"schema": 1, "target": target, "control_rate_hz": scenarios[0].control_rate_hz,
                "controllers": {controller: as_json(profile, target) for controller, profile in profiles.items()}}
-    (out / "processor.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    (out / "processor.json").write_text(json_text(content), encoding="utf-8")
     write_pil_report(out, scenarios[0], content, {name: profile.interrupts for name, profile in profiles.items()})
     print(f"{summary(profiles, target)}\n\nresults: {out / 'results.json'}, {out / 'processor.json'}\n"
           f"report:  {out / 'report.html'}")

@@ -20,6 +20,7 @@ from salient.experiments.compare.machine import Subject, cases_of, subject, targ
 from salient.experiments.compare.runner import RunMetrics, run_all
 from salient.experiments.compare.targets import TARGETS
 from salient.experiments.scenario import check_parameters, with_setting
+from salient.experiments.tasks import RESULTS
 from salient.machine.cache import machine_image
 from salient.machine.file import MachineError
 from salient.paths import COMMAND, make_folder
@@ -34,18 +35,22 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
         stream.writelines(f"{name:<20}{group.title}{' (long: runs only when named)' if group.long else ''}\n"
                           for name, group in GROUPS.items())
         return 0
-    cases = _cases(options.groups, options.quick)
+    # Options are refused before the cases are made: a group may have a thousand of them, with files of their own.
+    groups = _groups(options.groups)
+    on = None if options.machine is None else _subject(options.machine)
+    if options.true_machine is not None:
+        _check_true_machine(groups, options.machine, options.true_machine)
+    settings = _settings(options.set)
+    earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
+    cases = [case for name in groups for case in GROUPS[name].cases(options.quick)]
     titles, targets = TITLES, TARGETS
-    if options.machine is not None:
-        on = _subject(options.machine)
+    if on is not None:
         cases, titles = cases_of(cases, on, options.quick), {name: on.text(title) for name, title in titles.items()}
         targets = TARGETS if on.is_bundled else targets_of(on)
     if options.true_machine is not None:
-        cases = _with_true_machine(cases, options.machine, options.true_machine)
-    cases = _with_settings(_first_samples(cases, options.samples), options.set)
-    earlier = None if options.baseline is None else results_file.read(options.baseline, options.quick)
-    make_folder(options.out, (f"{FAILED}/*.toml", f"{mismatch.FILES}/*/*.*", results_file.NAME, PAGE,
-                              summary_file.NAME))
+        cases = [replace(case, scenario=replace(case.scenario, true_machine=options.true_machine)) for case in cases]
+    cases = _with_settings(_first_samples(cases, options.samples), settings)
+    make_folder(options.out, _of_earlier_run(options.out))
     machine_files = mismatch.copy_files(cases, options.out)
     runs = run_all(cases, options.jobs, sys.stderr, options.out, not options.resume, options.scheduler)
     rows = table.make_rows(runs, targets)
@@ -79,12 +84,20 @@ def run(options: argparse.Namespace, stream: TextIO = sys.stdout) -> int:
     return 1 if any(change.worse for change in changes) else 0
 
 
-def _cases(groups: Sequence[str], quick: bool) -> list[Case]:
-    for name in groups:
+def _of_earlier_run(out: Path) -> Sequence[str]:
+    """Patterns of the files that an earlier run has left in a folder: none without its results, since a folder of the
+    user may have machine files and failed scenarios of his own."""
+    if not any((out / name).is_file() for name in (results_file.NAME, RESULTS)):
+        return ()
+    return f"{FAILED}/*.toml", f"{mismatch.FILES}/*/*.*", results_file.NAME, PAGE, summary_file.NAME
+
+
+def _groups(named: Sequence[str]) -> list[str]:
+    """The groups in their order; all but the long ones without a name. UsageError: there is no such group."""
+    for name in named:
         if name not in GROUPS:
             raise UsageError(f"unknown group {name}: {close_names(name, GROUPS)} (--list)")
-    return [case for name, group in GROUPS.items() if name in groups or (not groups and not group.long)
-            for case in group.cases(quick)]
+    return [name for name, group in GROUPS.items() if name in named or (not named and not group.long)]
 
 
 def _subject(name_or_path: str) -> Subject:
@@ -94,14 +107,13 @@ def _subject(name_or_path: str) -> Subject:
         raise UsageError(str(error)) from None
 
 
-def _with_true_machine(cases: Sequence[Case], machine: str | None, true_machine: str) -> list[Case]:
-    """The cases with another machine in the emulator. UsageError: without --machine, or the two do not fit."""
+def _check_true_machine(groups: Sequence[str], machine: str | None, true_machine: str) -> None:
+    """UsageError: without --machine, with a group whose runs have their own, or the two do not fit."""
     if machine is None:
         raise UsageError(f"--true-machine {true_machine}: only with --machine, whose drive it replaces the motor of")
-    if any(case.group == mismatch.GROUP for case in cases):
+    if mismatch.GROUP in groups:
         raise UsageError(f"--true-machine {true_machine}: not with {mismatch.GROUP}, whose runs have their own")
     machine_image(machine, true_machine)  # checks them
-    return [replace(case, scenario=replace(case.scenario, true_machine=true_machine)) for case in cases]
 
 
 def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
@@ -113,14 +125,22 @@ def _first_samples(cases: Sequence[Case], count: int | None) -> list[Case]:
     return [case for case in cases if case.sample in kept[case.group, case.condition]]
 
 
-def _with_settings(cases: Sequence[Case], settings: Sequence[str]) -> list[Case]:
-    """The cases with a parameter of the drive or a variable of the bench set in all of them."""
-    changed = list(cases)
-    for text in settings:
+def _settings(texts: Sequence[str]) -> list[tuple[str, float]]:
+    """Name and value of each --set."""
+    found = []
+    for text in texts:
         name, values = parse_values(text)
         if len(values) != 1:
             raise UsageError(f"--set {text}: must be one value; salient sweep takes several")
-        changed = [replace(case, scenario=with_setting(case.scenario, name, values[0])) for case in changed]
+        found.append((name, values[0]))
+    return found
+
+
+def _with_settings(cases: Sequence[Case], settings: Sequence[tuple[str, float]]) -> list[Case]:
+    """The cases with a parameter of the drive or a variable of the bench set in all of them."""
+    changed = list(cases)
+    for name, value in settings:
+        changed = [replace(case, scenario=with_setting(case.scenario, name, value)) for case in changed]
     if settings:
         checked = {repr(scenario): scenario for case in changed
                    for scenario in [replace(case.scenario, seed=DEFAULTS["seed"], initial_angle_deg=0.0)]}

@@ -21,15 +21,19 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, ValidationError
 
 from salient.errors import UsageError
 from salient.experiments.compare.runner import RunMetrics
 from salient.experiments.compare.table import Row
 from salient.experiments.results import rounded
+from salient.toml_file import TextFileError, read_text
 
 SCHEMA = 1
 NAME = "compare.json"
+_FILE_BYTES_MAX = 100_000_000
 
 
 def content(rows: Sequence[Row], runs: Sequence[RunMetrics], quick: bool) -> dict[str, Any]:
@@ -69,17 +73,37 @@ def write(path: Path, stored: Mapping[str, Any]) -> None:
     path.write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")
 
 
+class _StoredRow(BaseModel):
+    """The part of a row that a comparison reads."""
+
+    group: str
+    condition: str
+    figure: str
+    statistic: str
+    values: dict[str, float | None]
+    failed: dict[str, str]
+
+
+class _Stored(BaseModel):
+    """The part of a file that a comparison reads."""
+
+    schema_number: Annotated[Literal[1], Field(alias="schema")]
+    quick: bool
+    rows: list[_StoredRow]
+
+
 def read(path: Path, quick: bool) -> dict[str, Any]:
     """A baseline from its folder or file; UsageError when the file is invalid or its runs are not comparable."""
     file = path / NAME if path.is_dir() else path
     try:
-        stored = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"--baseline {file}: {error.strerror}") from None
+        stored = _Stored.model_validate(json.loads(read_text(file, _FILE_BYTES_MAX)), strict=True)
+    except TextFileError as error:
+        raise UsageError(f"--baseline {file}: {error}") from None
+    except ValidationError as error:
+        place = ".".join(str(part) for part in error.errors()[0]["loc"])
+        raise UsageError(f"--baseline {file}: not a {NAME} of schema {SCHEMA}{f': {place}' if place else ''}") from None
     except (ValueError, RecursionError):
         raise UsageError(f"--baseline {file}: not JSON; pass the folder or the {NAME} of an earlier run") from None
-    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA or not isinstance(stored.get("rows"), list):
-        raise UsageError(f"--baseline {file}: not a {NAME} of schema {SCHEMA}")
-    if stored.get("quick") != quick:
+    if stored.quick != quick:
         raise UsageError(f"--baseline {file}: made {'without' if quick else 'with'} --quick; both runs must agree")
-    return stored
+    return stored.model_dump()
