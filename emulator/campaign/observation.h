@@ -172,7 +172,7 @@ double observation_recovery_speed_rpm(observation_t *seen);
 
 void observation_at_end(observation_t *seen, observation_heat_t heat);
 
-/* Begin of a condition: the time now when it begins to hold, 0 when it does not hold. */
+/* Start of a condition: the time now when it begins to hold, 0 when it does not hold. */
 void observation_since(uint64_t *begin_ns, bool holds, uint64_t now_ns);
 
 /* Time for which the rotor has stayed within a range of angles while it is asked for. */

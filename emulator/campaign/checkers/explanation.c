@@ -100,7 +100,7 @@ static bool has_reason(const observation_t *seen, unsigned cause) {
 
 /* --- Of the faults --- */
 
-/* Begin of the latest fault of a phase or of a sensor of the motion. */
+/* Start of the latest fault of a phase or of a sensor of the motion. */
 static uint64_t latest_fault_ns(const observation_t *seen) {
     uint64_t latest_us = 0;
     for (unsigned i = 0; i < seen->world->events; i++) {

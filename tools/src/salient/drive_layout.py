@@ -20,7 +20,7 @@ _ALIASES = {"DW_TAG_typedef", "DW_TAG_const_type", "DW_TAG_volatile_type"}
 _VARIABLE = b"drive_layout"
 _BYTES_MAX = 4
 _WASM = b"\0asm\1\0\0\0"
-"""Begin of a WebAssembly module."""
+"""Start of a WebAssembly module."""
 _CUSTOM_SECTION = 0
 _SIGNED = {5, 6}
 """DW_ATE_signed and DW_ATE_signed_char."""

@@ -285,7 +285,7 @@ def _earlier_maps(path: Path) -> list[Path]:
 
 
 def _staging(path: Path) -> str:
-    """Begin of the name of the folder in which a machine file is written."""
+    """Start of the name of the folder in which a machine file is written."""
     return f".{path.name}."
 
 

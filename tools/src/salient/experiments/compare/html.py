@@ -36,7 +36,7 @@ def write_page(path: Path, rows: Sequence[Row], content: Mapping[str, Any], chan
 
 
 def _write_plots(folder: Path, plots_of: Mapping[str, Sequence[Plot]]) -> None:
-    """GROUP.png, GROUP_2.png and so on; those of an earlier run are removed."""
+    """GROUP.png, GROUP_2.png and so on; files of an earlier run are removed."""
     for earlier in folder.glob("*.png"):
         earlier.unlink()
     for group, of in plots_of.items():
