@@ -27,7 +27,8 @@
  * the missing torque, reference less estimate, half of it in an electrical revolution: it makes the mean torque equal
  * the reference. It begins where a shortfall has lasted, above base speed at once: the way by the advance is longer and
  * leaves up to 5 % of the torque missing. With single pulses the torque
- * pulsates, and the reference of the instantaneous torque is raised by level * (T_peak - T_mean).
+ * pulsates, and the reference of the instantaneous torque is raised by level^2 (T_peak - T_mean): at low levels phases
+ * still follow any reference, and one that is raised in proportion would be exceeded by the mean torque.
  *
  * From base speed on, fully at 1.125 of it, the angles are instead those for the part of the largest mean torque,
  *

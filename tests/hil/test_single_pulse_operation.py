@@ -5,6 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from salient.machine.drive_data import derive
+from salient.machine.file import load_machine
+from salient.machine.path import machine_path
+
 MACHINE = "linear_cosine"
 """Its largest torque without lead is 15 N m at 2250 r/min, 1.5 times the base speed; with single pulses 25 N m."""
 
@@ -68,3 +72,21 @@ def test_current_stays_within_three_percent_of_its_limit_at_20_kHz(make_bench, t
     recording = np.load(tmp_path / "recording.npy")
     peak_A = max(float(recording[name].max()) for name in recording.dtype.names if name.startswith("current_"))
     assert 0.97 < peak_A / 52 < 1.03
+
+
+@pytest.mark.in_turns
+@pytest.mark.parametrize("machine", ["saturating", "finite_element", "linear_cosine", "linear_trapezoid"])
+def test_braking_below_base_speed_makes_the_torque_limit_within_a_tenth(make_bench, machine):
+    """Over a stroke or more: linear_trapezoid braked with 1.4 times its limit."""
+    data = derive(load_machine(machine_path(machine)))
+    limit_Nm = data.parameters["torque_max_Nm"]
+    bench = make_bench(machine=machine, controller="salient")
+    bench.drive.speed_reference_rpm = 0.9 * data.speed_base_rpm
+    bench.run_for(0.65)
+    begin_s = bench.time_s
+    bench.drive.speed_reference_rpm = 0
+    bench.run_until(lambda: bench.truth["speed_rpm"].last < 0.3 * data.speed_base_rpm, timeout=0.2)
+    torque_Nm = bench.truth["torque_Nm"].between(begin_s + 0.002, bench.time_s).value
+    mean_Nm = np.convolve(torque_Nm, np.full(10, 0.1), "valid")
+    assert len(mean_Nm) > 3
+    assert -1.1 * limit_Nm < mean_Nm.min() and mean_Nm.max() < -0.85 * limit_Nm

@@ -228,7 +228,7 @@ struct model_t {
         if (level > 0.0) {
             on = blend(std::max(enter, 0.0), -lead, level);
             leave = blend(leave, end, level);
-            ripple = level * (peak - mean);
+            ripple = level * level * (peak - mean);
         }
         single_pulse = level > 0.0;
         at_threshold = level < 0.001;
