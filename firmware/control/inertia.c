@@ -34,8 +34,12 @@
 #define REST_SMALL (REST_ONE / 8 * 5)
 #define REST_LARGE (REST_ONE / 4 * 7)
 
-/* Part of the least variance that a straight regression needs. */
-#define STRAIGHT_VARIANCE_SHIFT 2
+/* Parts of the least variance with which a rest is followed, and with which the first one of a run is found. */
+#define FOLLOWED_VARIANCE_SHIFT 2
+#define FIRST_VARIANCE_SHIFT 6
+
+/* Part of the variance of A that the counts may be for the first one: two windows are always on a line. */
+#define COUNTS_SHIFT 4
 
 /* Longer windows, of coarse encoders, are means over more than a ramp of an acceleration. */
 #define FINE_RATE_MIN_HZ 300u
@@ -65,12 +69,16 @@ inertia_parameters_t inertia_configure(const inertia_settings_t *settings) {
         shift++;
     }
     const int32_t deviation_q23 = settings->torque_max_q24 / 2 / DEVIATION_SHARE;
+    const int32_t gain = fixed_saturate(gain_q8(settings, update_rate_hz >> shift));
+    const int32_t count_q23 = fixed_saturate((int64_t)gain * count >> 8);
+    /* A second difference of angles that are each off by up to half a count: 6/12 of its square. */
+    const int32_t count_variance_q14 = fixed_max(fixed_multiply_high(count_q23, count_q23) / 2, 1);
     return (inertia_parameters_t){
-        .gain_q8 = fixed_saturate(gain_q8(settings, update_rate_hz >> shift)),
+        .gain_q8 = gain,
         .variance_min_q14 = fixed_multiply_high(deviation_q23, deviation_q23),
         .window_shift = shift,
         .torque_shift = 2 * shift + 2,
-        .fine = update_rate_hz >> shift >= FINE_RATE_MIN_HZ,
+        .count_variance_q14 = update_rate_hz >> shift >= FINE_RATE_MIN_HZ ? count_variance_q14 : 0,
         .reaching_gain_q24 = settings->reaching_gain_q24,
         .rate_q8 = settings->rate_q8,
     };
@@ -266,8 +274,10 @@ static void move_rest(inertia_t *inertia, int32_t change) {
 static bool is_straight(const inertia_parameters_t *parameters, const inertia_t *inertia) {
     const int32_t variance = inertia->torque_variance_q14, covariance = inertia->covariance_q14;
     const int64_t product = fixed_product(variance, inertia->acceleration_variance_q14);
-    return variance >= parameters->variance_min_q14 >> STRAIGHT_VARIANCE_SHIFT && covariance >= variance / 8 &&
-           fixed_product(covariance, covariance) >= product - (product >> 5);
+    const bool beyond_counts = inertia->acceleration_variance_q14 >> COUNTS_SHIFT >= parameters->count_variance_q14;
+    const bool first = inertia->rest_q14 == REST_ONE && beyond_counts;
+    return variance >= parameters->variance_min_q14 >> (first ? FIRST_VARIANCE_SHIFT : FOLLOWED_VARIANCE_SHIFT) &&
+           covariance >= variance / 8 && fixed_product(covariance, covariance) >= product - (product >> 5);
 }
 
 COLD NOINLINE void inertia_refine(const inertia_parameters_t *parameters, const load_observer_model_t *model,
@@ -280,7 +290,7 @@ COLD NOINLINE void inertia_refine(const inertia_parameters_t *parameters, const 
     const int32_t change = fixed_clamp(inertia->shift - inertia->refined_shift, -1, 1);
     inertia->refined_windows = windows;
     inertia->refined_shift = inertia->shift;
-    if (!parameters->fine) {
+    if (parameters->count_variance_q14 == 0) {
         inertia->ratio_q14 = scaled(REST_ONE, inertia->shift);
         return;
     }

@@ -25,8 +25,10 @@
  * A position is followed by a feed-forward in proportion to the inertia, for which a power of two is not enough. There
  * the rest g = J0 / (J 2^k), within 1/2..2, follows the regression where it is straight, cov(T, A)^2 > 31/32 var(T)
  * var(A), in each window by half or more of what is missing; by an eighth or more when that is less than a quarter, for
- * the counts of a heavy shaft are noise. A quarter of the variance is enough. A rest beyond 5/8..7/4 changes k. The
- * reciprocal comes by Newton's method. Each run begins with a rest of 1; with coarse encoders it stays.
+ * the counts of a heavy shaft are noise. A quarter of the variance is enough. For the first rest of a run a 64th is,
+ * with which a move of some counts is over, where the encoder's counts are at most a 16th of var(A): their second
+ * difference has half the square of one. A rest beyond 5/8..7/4 changes k. The reciprocal comes by Newton's method.
+ * Each run begins with a rest of 1; with coarse encoders it stays.
  */
 #ifndef CONTROL_INERTIA_H
 #define CONTROL_INERTIA_H
@@ -44,13 +46,13 @@ typedef struct {
 } inertia_laws_t;
 
 typedef struct {
-    int32_t gain_q8;           /* J0 / window^2: N m, Q8.23, per 2^-32 electrical rev, in Q8 */
-    int32_t variance_min_q14;  /* of the torque, (N m)^2, Q17.14 */
-    unsigned window_shift;     /* a window is 2^window_shift updates, from 1 */
-    unsigned torque_shift;     /* from N m, Q7.24, to half of T / 4^window_shift, Q8.23 */
-    int32_t reaching_gain_q24; /* of J0 */
-    int32_t rate_q8;           /* of J0 */
-    uint32_t fine;             /* the windows are short enough for the rest */
+    int32_t gain_q8;            /* J0 / window^2: N m, Q8.23, per 2^-32 electrical rev, in Q8 */
+    int32_t variance_min_q14;   /* of the torque, (N m)^2, Q17.14 */
+    unsigned window_shift;      /* a window is 2^window_shift updates, from 1 */
+    unsigned torque_shift;      /* from N m, Q7.24, to half of T / 4^window_shift, Q8.23 */
+    int32_t reaching_gain_q24;  /* of J0 */
+    int32_t rate_q8;            /* of J0 */
+    int32_t count_variance_q14; /* of A by the counts of the encoder, (N m)^2; 0: windows too long for the rest */
 } inertia_parameters_t;
 
 /* Laws of the inertia J0 / g. */

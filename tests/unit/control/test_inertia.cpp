@@ -38,9 +38,9 @@ inertia_settings_t settings(unsigned encoder_bits = 17, uint32_t rate_hz = 40000
 using torque_t = std::function<double(double)>;
 
 // Shift after half a second of a shaft of `gain` times the inertia J0, whose speed has settled after settled_s. last:
-// state of an earlier run, and after this one.
+// state of an earlier run, and after this one. accelerates: any torque changes the speed, as in position mode.
 int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &torque, const torque_t &load,
-                    inertia_t *last = nullptr, double settled_s = 1.0, bool fine = false) {
+                    inertia_t *last = nullptr, double settled_s = 1.0, bool fine = false, bool accelerates = false) {
     const inertia_parameters_t parameters = inertia_configure(&of);
     inertia_t inertia = last != nullptr ? *last : inertia_t{};
     const double step_s = double(of.periods_per_update) / of.control_rate_hz;
@@ -50,7 +50,7 @@ int32_t shift_after(const inertia_settings_t &of, double gain, const torque_t &t
     for (double t = 0.0; t < 0.5; t += step_s) {
         const uint32_t angle = angle_from_rev(std::floor(rev * counts) / counts) * POLES;
         inertia_step(&parameters, &inertia, angle, to_fixed(0.5 * (torque(t - step_s) + torque(t)), Q24),
-                     torque(t) >= TORQUE_MAX, t < settled_s);
+                     torque(t) >= TORQUE_MAX || (accelerates && torque(t) != 0.0), t < settled_s);
         if (fine) {
             inertia_refine(&parameters, &MODEL, &inertia);
         }
@@ -289,6 +289,33 @@ TEST(Inertia, a_position_is_followed_with_the_inertia_within_three_percent) {
             EXPECT_NEAR(inertia.laws.observer.acceleration_q32 * std::ldexp(inertia.ratio_q14, -14),
                         MODEL.acceleration_q32, 0.002 * MODEL.acceleration_q32);
         }
+    }
+}
+
+// Forwards and backwards with a part of the largest torque, after each other.
+torque_t way(double part, double duration_s) {
+    return [=](double t) {
+        const double since = t - 0.1;
+        const double sign = since < 0.0 || since >= 2.0 * duration_s ? 0.0 : since < duration_s ? 1.0 : -1.0;
+        return sign * part * TORQUE_MAX;
+    };
+}
+
+double ratio_after(double gain, const torque_t &torque, inertia_t *inertia) {
+    shift_after(
+        settings(), gain, torque, [](double) { return 0.0; }, inertia, 1.0, true, true);
+    return std::ldexp(inertia->ratio_q14, -14);
+}
+
+TEST(Inertia, a_first_move_with_a_twentieth_of_the_torque_shows_a_light_rotor_within_its_half) {
+    for (const double duration_s : {0.002, 0.004, 0.006}) {
+        for (const double part : {0.05, 0.06, 0.08}) {
+            inertia_t inertia{};
+            EXPECT_NEAR(ratio_after(0.3, way(part, duration_s), &inertia), 0.3, 0.15) << part << ", " << duration_s;
+        }
+        inertia_t inertia{};
+        EXPECT_EQ(ratio_after(0.3, way(0.01, duration_s), &inertia), 1.0) << "too little for any rest";
+        EXPECT_EQ(ratio_after(5.0, way(0.05, duration_s), &inertia), 1.0) << "of counts, more than of the torque";
     }
 }
 
