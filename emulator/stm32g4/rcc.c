@@ -107,6 +107,10 @@ static uint32_t timer_hz(uint32_t hclk, uint32_t code) {
     return code < 4 ? hclk : 2 * prescaled(hclk, code, 4);
 }
 
+static const char *range_name(bool range_1, bool is_boost) {
+    return !range_1 ? "range 2" : is_boost ? "boost mode" : "normal mode of range 1";
+}
+
 /* Wait states, 5.3.3, table 29; range 1: boost, normal. */
 static void check_speed(uint32_t hz) {
     static const uint32_t boost[] = {34, 68, 102, 136, 170}, normal[] = {30, 60, 90, 120, 150}, low[] = {12, 24, 26};
@@ -115,17 +119,12 @@ static void check_speed(uint32_t hz) {
     const unsigned count = range_1 ? 5 : 3, states = flash_wait_states();
     if (hz > limits[count - 1] * MHZ) {
         soc_violation("HCLK %u Hz: at most %u MHz in %s (PWR_CR1.VOS, PWR_CR5.R1MODE)", hz, limits[count - 1],
-                      !range_1   ? "range 2"
-                      : is_boost ? "boost mode"
-                                 : "normal mode of range 1");
+                      range_name(range_1, is_boost));
     }
     const unsigned allowed = states < count ? states : count - 1;
     if (hz > limits[allowed] * MHZ) {
         soc_violation("HCLK %u Hz with %u wait states: FLASH_ACR.LATENCY allows %u MHz in %s", hz, states,
-                      limits[allowed],
-                      !range_1   ? "range 2"
-                      : is_boost ? "boost mode"
-                                 : "normal mode of range 1");
+                      limits[allowed], range_name(range_1, is_boost));
     }
 }
 
@@ -229,6 +228,16 @@ static uint32_t rcc_read(uint32_t address) {
     }
 }
 
+/* Data sheet, characteristics of the PLL: output R, which may be enabled before the PLL runs. */
+static void check_pll_output(void) {
+    const bool range_1 = (REG(PWR_CR1) >> 9 & 3) == 1, is_boost = range_1 && !(REG(PWR_CR5) >> 8 & 1);
+    const uint32_t limit = !range_1 ? 26 : is_boost ? 170 : 150;
+    if (REG(CR) >> 24 & 1 && REG(PLLCFGR) >> 24 & 1 && pll_r_hz() > limit * MHZ) {
+        soc_violation("RCC_PLLCFGR.PLLREN with %u Hz: at most %u MHz in %s", pll_r_hz(), limit,
+                      range_name(range_1, is_boost));
+    }
+}
+
 static void start_pll(void) {
     const uint32_t input = pll_input_hz(), m = (REG(PLLCFGR) >> 4 & 15) + 1, n = REG(PLLCFGR) >> 8 & 127;
     if (input == 0 || ((REG(PLLCFGR) & 3) == 3 && !ready(HSE))) {
@@ -252,6 +261,7 @@ static void cr_write(uint32_t value) {
     }
     run(HSE, value >> 16 & 1);
     run(PLL, value >> 24 & 1);
+    check_pll_output();
 }
 
 static void cfgr_write(uint32_t value) {
@@ -289,6 +299,7 @@ static void rcc_write(uint32_t address, uint32_t value) {
             soc_violation("write of RCC_PLLCFGR, value 0x%08X: the PLL runs", value);
         }
         REG(PLLCFGR) = value;
+        check_pll_output();
         break;
     case BDCR:
         bdcr_write(value);
@@ -321,6 +332,7 @@ static void pwr_write(uint32_t address, uint32_t value) {
     access_seen = access_seen && REG(PWR_CR1) >> 8 & 1;
     if (address == PWR_CR1 || address == PWR_CR5) {
         clocks_changed();
+        check_pll_output();
     }
 }
 

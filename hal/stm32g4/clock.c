@@ -39,17 +39,12 @@ static void peripherals_clock(void) {
     (void)RCC_APB2ENR; /* a peripheral answers two cycles after its clock has been enabled */
 }
 
-/* Above 80 MHz the AHB clock goes there in two steps (RM0440, PWR: dynamic voltage scaling management). */
+/* Above 80 MHz the AHB clock goes there in two steps, and boost mode comes before the PLL whose output needs it
+ * (RM0440, PWR: dynamic voltage scaling management). */
 static void system_clock(void) {
     RCC_CR |= RCC_CR_HSEON;
     while (!(RCC_CR & RCC_CR_HSERDY)) { /* without the crystal there is no drive: all switches stay open */
     }
-    RCC_PLLCFGR = PUT(RCC_PLLCFGR_PLLSRC, SOURCE_HSE) | PUT(RCC_PLLCFGR_PLLM, PLL_M - 1) |
-                  PUT(RCC_PLLCFGR_PLLN, PLL_N) | PUT(RCC_PLLCFGR_PLLR, PLL_R / 2 - 1);
-    RCC_CR |= RCC_CR_PLLON;
-    while (!(RCC_CR & RCC_CR_PLLRDY)) {
-    }
-    RCC_PLLCFGR |= RCC_PLLCFGR_PLLREN;
     RCC_CFGR = (RCC_CFGR & ~RCC_CFGR_HPRE) | PUT(RCC_CFGR_HPRE, HPRE_2);
 #if BOARD_CLOCK_MHZ > 150
     PWR_CR5 &= ~PWR_CR5_R1MODE; /* boost mode */
@@ -57,6 +52,12 @@ static void system_clock(void) {
     FLASH_ACR = (FLASH_ACR & ~FLASH_ACR_LATENCY) | PUT(FLASH_ACR_LATENCY, WAIT_STATES) | FLASH_ACR_PRFTEN;
     while (GET(FLASH_ACR_LATENCY, FLASH_ACR) != WAIT_STATES) {
     }
+    RCC_PLLCFGR = PUT(RCC_PLLCFGR_PLLSRC, SOURCE_HSE) | PUT(RCC_PLLCFGR_PLLM, PLL_M - 1) |
+                  PUT(RCC_PLLCFGR_PLLN, PLL_N) | PUT(RCC_PLLCFGR_PLLR, PLL_R / 2 - 1);
+    RCC_CR |= RCC_CR_PLLON;
+    while (!(RCC_CR & RCC_CR_PLLRDY)) {
+    }
+    RCC_PLLCFGR |= RCC_PLLCFGR_PLLREN;
     RCC_CFGR = (RCC_CFGR & ~RCC_CFGR_SW) | PUT(RCC_CFGR_SW, SOURCE_PLL);
     while (GET(RCC_CFGR_SWS, RCC_CFGR) != SOURCE_PLL) {
     }
