@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -128,3 +130,22 @@ def salient_without_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         return subprocess.CompletedProcess(argv, code, *capsys.readouterr())
 
     return run
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, None, None]:
+    """Frees what the tests of a file kept for each other, after the last of them: a process runs a hundred files."""
+    yield
+    of, next_of = (each and each.getparent(pytest.Module) for each in (item, nextitem))
+    if isinstance(of, pytest.Module) and of is not next_of:
+        clear_caches(of.obj)
+        gc.collect()
+
+
+def clear_caches(module: ModuleType) -> None:
+    """Empties the caches that a module made; those that it imported serve other modules, too."""
+    for name, value in vars(module).items():
+        if hasattr(value, "cache_clear"):
+            home = sys.modules.get(value.__module__)
+            if home is module or getattr(home, name, None) is not value:
+                value.cache_clear()

@@ -62,6 +62,43 @@ def test_a_marked_file_is_run_as_a_whole_in_its_turn(folder):
     assert "no tests collected (25 deselected)" in done.stdout, done.stdout + done.stderr
 
 
+CACHES = """
+from functools import lru_cache
+
+from salient.turns import turn_of_name
+
+@lru_cache
+def made_here(name):
+    return object()
+
+imported_and_wrapped = lru_cache(turn_of_name)
+
+def test_one():
+    made_here(1), imported_and_wrapped("a")
+
+def test_two():
+    assert made_here.cache_info().currsize == imported_and_wrapped.cache_info().currsize == 1
+"""
+NEXT_FILE = """
+from test_a import imported_and_wrapped, made_here
+
+def test_next():
+    assert made_here.cache_info().currsize == imported_and_wrapped.cache_info().currsize == 0
+    made_here(2)
+
+def test_last():
+    assert made_here.cache_info().currsize == 1
+"""
+
+
+def test_cached_results_of_a_file_are_kept_for_its_tests_and_freed_after_the_last_of_them(folder):
+    (folder / "test_a.py").write_text(CACHES)
+    (folder / "test_b.py").write_text(NEXT_FILE)
+    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={folder}",
+                           str(folder)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "4 passed" in done.stdout, done.stdout + done.stderr
+
+
 def test_turn_of_a_commit_is_one_of_all():
     assert turn_of_commit() in range(TURNS)
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
