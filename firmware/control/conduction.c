@@ -270,8 +270,7 @@ static inline void blend_single_pulse(const conduction_pulse_t *pulse, int32_t l
                                       conduction_interval_t *interval, int32_t *ripple_q24) {
     interval->on = blend(interval->enter < HALF_REV ? interval->enter : 0, -pulse->lead, level_q15);
     interval->leave = blend(interval->leave, pulse->end, level_q15);
-    const uint32_t largest_q24 = (uint32_t)(pulse->peak_q24 - pulse->mean_q24);
-    *ripple_q24 = (int32_t)blend(0, largest_q24, level_q15 * level_q15 >> 15);
+    *ripple_q24 = (int32_t)blend(0, (uint32_t)(pulse->peak_q24 - pulse->mean_q24), level_q15 * level_q15 >> 15);
 }
 
 /* --- Law above base speed: the pulse for a part of the largest torque --- */
