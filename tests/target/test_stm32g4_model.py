@@ -134,6 +134,8 @@ def test_dead_time_delays_the_edges_that_switch_on(tmp_path: Path, code: int, ti
     "an operation in bank 2 with FLASH_ACR.DCEN",
     "write of RCC_BDCR, value 0x1: PWR_CR1.DBP has not been read back",
     "return from exception 44, whose request has ended by the last access to a peripheral",
+    "RCC_PLLCFGR.PLLREN with 170000000 Hz: at most 150 MHz in normal mode of range 1",
+    "RCC_PLLCFGR.PLLREN with 170000000 Hz: at most 150 MHz in normal mode of range 1",
 ])))
 def test_breach_of_a_rule_ends_the_run_with_one_line(tmp_path: Path, case: int, text: str) -> None:
     result = run(tmp_path, "strict", definitions=(f"CASE={case}",))

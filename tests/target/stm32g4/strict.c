@@ -22,6 +22,8 @@ int test(void) {
     APB1ENR1 |= BIT(31);
     REG(0x40007C1Cu) = 1; /* LPTIM1_CNT */
 #elif CASE == 5
+    APB1ENR1 |= BIT(28);
+    REG(0x40007080u) = 0; /* PWR_CR5: boost */
     REG(RCC + 0x0C) = 2u | 3u << 4 | 85u << 8 | BIT(24);
     REG(RCC) |= BIT(24);
     while (!(REG(RCC) & BIT(25))) {
@@ -114,6 +116,15 @@ int test(void) {
     REG(TIM2 + 0x0C) = 1;
     REG(TIM2 + 0x14) = 1; /* UG: update interrupt */
     barrier();
+#elif CASE == 27
+    REG(RCC + 0x0C) = 2u | 3u << 4 | 85u << 8 | BIT(24); /* output R of 170 MHz */
+    REG(RCC) |= BIT(24);
+#elif CASE == 28
+    APB1ENR1 |= BIT(28);
+    REG(0x40007080u) = 0;
+    REG(RCC + 0x0C) = 2u | 3u << 4 | 85u << 8 | BIT(24);
+    REG(RCC) |= BIT(24);
+    REG(0x40007080u) = BIT(8); /* the end of boost, under a running PLL */
 #endif
     return 0;
 }
