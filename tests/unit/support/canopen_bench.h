@@ -62,6 +62,17 @@ class CanopenBench : public testing::Test {
         return frames;
     }
 
+    // Error codes of the emergencies among the frames since the last call of sent.
+    std::vector<unsigned> emergencies() {
+        std::vector<unsigned> codes;
+        for (const sent_t &frame : sent()) {
+            if (frame.identifier == 0x80 + NODE) {
+                codes.push_back(frame.data[0] | unsigned(frame.data[1]) << 8);
+            }
+        }
+        return codes;
+    }
+
     void receive(uint32_t identifier, const bytes_t &data, bool remote = false) {
         hal_can_frame_t frame{};
         frame.identifier = identifier;
