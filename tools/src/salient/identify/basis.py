@@ -94,10 +94,19 @@ class FluxBasis:
         """Squares of the third differences over the angle, by angle and current, where `roughness` has weights."""
         return np.asarray((self._across @ coefficients.reshape(self.rows, self.columns)) ** 2)
 
+    @cached_property
+    def _bends_of_map(self) -> sparse.csr_matrix:
+        """Third differences over the angle of all coefficients, by angle and current."""
+        return sparse.kron(self._across, sparse.eye(self.columns)).tocsr()
+
+    @cached_property
+    def _along(self) -> sparse.csr_matrix:
+        """Quadratic form of the third differences over the current."""
+        along = np.diff(np.eye(self.columns), 3, axis=0)
+        return sparse.kron(sparse.eye(self.rows), along.T @ along).tocsr()
+
     def roughness(self, weights: np.ndarray | None = None) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
         """Quadratic forms of the third differences over the angle, each with a weight, and over the current."""
-        across = sparse.kron(self._across, sparse.eye(self.columns)).tocsr()
+        across = self._bends_of_map
         weighted = across if weights is None else across.multiply(np.ravel(weights)[:, None])
-        along = np.diff(np.eye(self.columns), 3, axis=0)
-        return ((across.T @ weighted).tocsr(),
-                sparse.kron(sparse.eye(self.rows), along.T @ along).tocsr())
+        return (across.T @ weighted).tocsr(), self._along
