@@ -107,24 +107,45 @@ static uint32_t timer_hz(uint32_t hclk, uint32_t code) {
     return code < 4 ? hclk : 2 * prescaled(hclk, code, 4);
 }
 
-static const char *range_name(bool range_1, bool is_boost) {
-    return !range_1 ? "range 2" : is_boost ? "boost mode" : "normal mode of range 1";
+/* Range of the core's voltage, and the greatest HCLK by wait states (5.3.3, table 29). The last one bounds the
+ * output of the PLL, too (data sheet, characteristics of the PLL). */
+typedef struct {
+    const char *name;
+    unsigned count;
+    uint32_t mhz[5];
+} voltage_range_t;
+
+static const voltage_range_t *voltage_range(void) {
+    static const voltage_range_t low = {"range 2", 3, {12, 24, 26}},
+                                 normal = {"normal mode of range 1", 5, {30, 60, 90, 120, 150}},
+                                 boost = {"boost mode", 5, {34, 68, 102, 136, 170}};
+    const bool range_1 = (REG(PWR_CR1) >> 9 & 3) == 1;
+    return !range_1 ? &low : REG(PWR_CR5) >> 8 & 1 ? &normal : &boost;
 }
 
-/* Wait states, 5.3.3, table 29; range 1: boost, normal. */
+static uint32_t most_mhz(const voltage_range_t *range) {
+    return range->mhz[range->count - 1];
+}
+
 static void check_speed(uint32_t hz) {
-    static const uint32_t boost[] = {34, 68, 102, 136, 170}, normal[] = {30, 60, 90, 120, 150}, low[] = {12, 24, 26};
-    const bool range_1 = (REG(PWR_CR1) >> 9 & 3) == 1, is_boost = range_1 && !(REG(PWR_CR5) >> 8 & 1);
-    const uint32_t *limits = !range_1 ? low : is_boost ? boost : normal;
-    const unsigned count = range_1 ? 5 : 3, states = flash_wait_states();
-    if (hz > limits[count - 1] * MHZ) {
-        soc_violation("HCLK %u Hz: at most %u MHz in %s (PWR_CR1.VOS, PWR_CR5.R1MODE)", hz, limits[count - 1],
-                      range_name(range_1, is_boost));
+    const voltage_range_t *range = voltage_range();
+    const unsigned states = flash_wait_states();
+    if (hz > most_mhz(range) * MHZ) {
+        soc_violation("HCLK %u Hz: at most %u MHz in %s (PWR_CR1.VOS, PWR_CR5.R1MODE)", hz, most_mhz(range),
+                      range->name);
     }
-    const unsigned allowed = states < count ? states : count - 1;
-    if (hz > limits[allowed] * MHZ) {
-        soc_violation("HCLK %u Hz with %u wait states: FLASH_ACR.LATENCY allows %u MHz in %s", hz, states,
-                      limits[allowed], range_name(range_1, is_boost));
+    const uint32_t allowed_mhz = states < range->count ? range->mhz[states] : most_mhz(range);
+    if (hz > allowed_mhz * MHZ) {
+        soc_violation("HCLK %u Hz with %u wait states: FLASH_ACR.LATENCY allows %u MHz in %s", hz, states, allowed_mhz,
+                      range->name);
+    }
+}
+
+/* Output R may be enabled before the PLL runs. */
+static void check_pll_output(void) {
+    const voltage_range_t *range = voltage_range();
+    if (REG(CR) >> 24 & 1 && REG(PLLCFGR) >> 24 & 1 && pll_r_hz() > most_mhz(range) * MHZ) {
+        soc_violation("RCC_PLLCFGR.PLLREN with %u Hz: at most %u MHz in %s", pll_r_hz(), most_mhz(range), range->name);
     }
 }
 
@@ -225,16 +246,6 @@ static uint32_t rcc_read(uint32_t address) {
         return with_bit(value, 1, ready(HSI48));
     default:
         return value;
-    }
-}
-
-/* Data sheet, characteristics of the PLL: output R, which may be enabled before the PLL runs. */
-static void check_pll_output(void) {
-    const bool range_1 = (REG(PWR_CR1) >> 9 & 3) == 1, is_boost = range_1 && !(REG(PWR_CR5) >> 8 & 1);
-    const uint32_t limit = !range_1 ? 26 : is_boost ? 170 : 150;
-    if (REG(CR) >> 24 & 1 && REG(PLLCFGR) >> 24 & 1 && pll_r_hz() > limit * MHZ) {
-        soc_violation("RCC_PLLCFGR.PLLREN with %u Hz: at most %u MHz in %s", pll_r_hz(), limit,
-                      range_name(range_1, is_boost));
     }
 }
 
